@@ -5,7 +5,7 @@ The names below are the Python API; each is imported when it is first used, so t
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-C would show a traceback
+TYPE_CHECKING = False  # not typing's: Ctrl-C during that import would show a traceback
 if TYPE_CHECKING:  # "as" says that the name is public here
     from typing import Any
 
@@ -82,6 +82,6 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'scanchain' has no attribute {name!r}")
     value = getattr(import_module(f"scanchain.{_HOMES[name]}"), name)
-    if "numba" in sys.modules:  # it may be compiled when it is called
+    if "numba" in sys.modules:  # calling the value may compile kernels
         import_module("scanchain.clock").warn_of_compilation()
     return globals().setdefault(name, value)

@@ -52,15 +52,15 @@ for _command in (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned.
 
-    arguments : those of the process where left out, which then ends with that code, without the quarter of a
-        second in which the interpreter frees what the system frees at once
+    arguments : None for those of the process, which then exits with that code at once: it skips the quarter of a
+        second in which the interpreter would free memory that the system frees anyway
     """
     if arguments is not None:
         return _run(list(arguments))
     code = _run(sys.argv[1:])
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):  # of one that is closed
+        with suppress(AttributeError, OSError, ValueError):  # a closed stream
             stream.flush()
     os._exit(code)
 
@@ -86,7 +86,7 @@ def _run(words: list[str]) -> int:
         return _fail(error.text + hint, 2 if isinstance(error, InputError) else 1)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted", 1)
-    except BrokenPipeError:  # the reader of our output went away, as `head` does
+    except BrokenPipeError:  # the reader of our output closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:

@@ -1,7 +1,7 @@
-"""Compilation of kernels ahead of the first run that needs them, by a process for each core.
+"""Parallel compilation of kernels before the first run that needs them, one process per core.
 
-Numba compiles a kernel together with those that it calls, one after the other. Here a kernel is compiled as soon
-as those that it calls lie in the cache: each once, and side by side.
+Numba compiles a kernel together with those that it calls, in sequence. Here a kernel is compiled as soon as those
+that it calls are in the cache: each kernel once, independent ones in parallel.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from scanchain.kernels import compiling  # which chooses the folder
 from scanchain.threads import threads
 
 TABLE = Path(compiling.__file__).with_name("signatures.json")
-KINDS = "2d", "3d", "rest"  # kernels of a run in the plane, of one in space, and of what else there is
-_MOST = 8  # processes; the longest chain of calls takes as long as an eighth of all
+KINDS = "2d", "3d", "rest"  # kernels needed by 2D runs, by 3D runs, and by everything else
+_MOST = 8  # largest useful number of processes: the longest chain of calls takes an eighth of the total time
 
 
 class Signature(NamedTuple):
@@ -45,8 +45,8 @@ class Signature(NamedTuple):
 def compile_ahead(kinds: Sequence[str], count: Callable[[int, int], None]) -> bool:
     """True if the cache has all kernels of these kinds; what it lacks is compiled now.
 
-    Where it has not, because no folder can keep them or a process ended early, calls compile what they need.
-    count : told how many of how many are done
+    False if there is no cache folder or a process ended early; kernels are then compiled when first called.
+    count : callback with the number of kernels compiled so far and the total
     """
     folder: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
     if not folder or config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
@@ -65,7 +65,7 @@ def compile_ahead(kinds: Sequence[str], count: Callable[[int, int], None]) -> bo
 
 @cache
 def _state() -> str:
-    """Name of all that decides what is compiled: sources, signatures, versions, processor."""
+    """Hash of all that the compiled code depends on: sources, signatures, versions, processor."""
     made_by = f"{sys.version} {numba.__version__} {binding.get_host_cpu_name()} {compiling.digest_of_sources()}"
     return sha256(made_by.encode() + TABLE.read_bytes()).hexdigest()[:16]
 
@@ -79,7 +79,7 @@ def _compile_all(kinds: Sequence[str], cores: int, count: Callable[[int, int], N
     order.prepare()
     ready: list[str] = []
     done, is_whole, running = 0, True, dict[Future[bool], tuple[str, _Worker]]()
-    with ThreadPoolExecutor(cores) as pool, ExitStack() as stack:  # which ends processes that threads wait for
+    with ThreadPoolExecutor(cores) as pool, ExitStack() as stack:  # kills processes that threads wait for
         workers = [stack.enter_context(_Worker(kinds)) for _ in range(cores)]
         while order.is_active() and (workers or running):
             ready = sorted([*ready, *order.get_ready()], key=heights.__getitem__)
@@ -98,7 +98,7 @@ def _compile_all(kinds: Sequence[str], cores: int, count: Callable[[int, int], N
 
 
 class _Worker:
-    """A process that compiles the kernels named to it. A context manager."""
+    """A process that compiles kernels on request. A context manager."""
 
     def __init__(self, kinds: Sequence[str]) -> None:
         self.process = subprocess.Popen(
@@ -127,7 +127,7 @@ class _Worker:
 
 
 def _heights(calls: dict[str, set[str]]) -> dict[str, int]:
-    """Bytes of code on the longest chain of callers that wait for each kernel, its own included."""
+    """Priority of each kernel: bytes of code on the longest chain of its callers, its own included."""
     callers: dict[str, set[str]] = {name: set() for name in calls}
     for name, called in calls.items():
         for each in called:
@@ -141,7 +141,7 @@ def _heights(calls: dict[str, set[str]]) -> dict[str, int]:
 
 
 def _called(kernel: Dispatcher, names: set[str]) -> set[str]:
-    """Those of the names that a kernel calls, itself or by a kernel that is inlined."""
+    """Those of the named kernels that a kernel calls, directly or through an inlined kernel."""
     found: set[str] = set()
     for word in kernel.py_func.__code__.co_names:
         other = kernel.py_func.__globals__.get(word)
@@ -164,7 +164,7 @@ def _named(name: str) -> Any:
 
 
 def signatures(kinds: Sequence[str] = KINDS) -> list[Signature]:
-    """Those of the table that one of the kinds needs."""
+    """Signatures of the table that at least one of the kinds needs."""
     table = json.loads(TABLE.read_text())
     known = dict[str, types.Type]()
     for name, fields in table["tuples"].items():
@@ -191,7 +191,7 @@ def _type_of(word: str, known: dict[str, types.Type]) -> types.Type:
 
 
 def _work(kinds: Sequence[str]) -> None:
-    """Compile the kernels that are named on standard input, a line each; answer each with a line."""
+    """Compile the kernels named on standard input, one per line; acknowledge each with an empty line."""
     table = signatures(kinds)
     for line in sys.stdin:
         for each in table:

@@ -1,4 +1,4 @@
-"""The commands as functions, and SLAM of scans from anywhere with the map and the verdict that a run has."""
+"""The commands as functions, and SLAM on scans from any source, with the map and the verdict of a run."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Logs = str | Path | Sequence[str | Path]
 
 @contextmanager
 def _freeing() -> Iterator[None]:
-    """Errors that leave it retain no log, map or file of points, where the caller retains them."""
+    """Context that clears the frames of errors: one that the caller keeps then keeps no log or map alive."""
     try:
         yield
     except (ScanchainError, KeyboardInterrupt) as error:
@@ -57,16 +57,16 @@ def _freeing() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class SlamResult(core.SlamResult):
-    """The result of a log, with the map and the verdict that a run has.
+    """SLAM result of a log, with the map and the verdict of a run.
 
     trajectory, odometry : T_world_lidar of every scan, after and before optimization
-    keyframes : the scans that stand in the graph; T_world_keyframes (K, d+1, d+1) are their final poses
+    keyframes : the scans that are nodes of the graph; T_world_keyframes (K, d+1, d+1) are their final poses
     closures : every loop closure tried
-    graph, state : the pose graph, and how it was left
-    components : (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule
-    elevation_offset_rad, calibrated_from : what vertical angles were corrected by, from which scan on; 0 as a rule
-    map_errors : of the keyframes, against the map that they were aligned to
-    config, steps : what it was made with, and the columns of steps.parquet
+    graph, state : the pose graph, and its state after the last optimization
+    components : (K,) label of each keyframe's submap; no loop joins different submaps; usually there is one
+    elevation_offset_rad, calibrated_from : correction of vertical angles, and the first scan with it; usually 0
+    map_errors : of the keyframes' poses, relative to the map that they were aligned to
+    config, steps : the configuration used, and the table that a run writes as steps.parquet
     """
 
     __repr__ = brief
@@ -78,7 +78,7 @@ class SlamResult(core.SlamResult):
         return cloud_of(self.keyframes, self.T_world_keyframes, self.config).points
 
     def verdict(self) -> Judged:
-        """The verdict on the trajectory, with reasons and stretches, as a run is judged."""
+        """The verdict on the trajectory, with reasons and segments, by the same checks as for a run."""
         final, expected = final_verdicts(self.closures, self.state), expected_of(self, self.config)
         table = closures_table(final, self.keyframes, self.trajectory.dimension)
         return judge(evidence_of(self.steps, table, expected and expected.ate))
@@ -88,7 +88,7 @@ class Slam(core.Slam):
     """Odometry, loop closing and pose graph: a step for every scan, the result at the end."""
 
     def place(self, located: Located) -> Step:
-        """Place one scan that ``front_end`` located."""
+        """Add one scan that ``front_end`` located to the graph, and close loops."""
         step = super().place(located)
         self.steps.append(step)
         return step
@@ -99,10 +99,10 @@ class Slam(core.Slam):
         return StepTable()
 
     def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
-        """Close what is left, optimize once more, spread the corrections over all scans and refine these.
+        """Close the remaining loops, optimize once more, correct all scans accordingly and refine their poses.
 
         progress : called with the name of each stage when it begins
-        Raises InputError without a scan, and when called again.
+        Raises InputError if no scan was processed, and when called again.
         """
         result = super().finish(progress)
         steps = self.steps.table(result.trajectory, self.T_base_lidar)
@@ -149,7 +149,7 @@ def localize(
     force: bool = False,
     **overrides: object,
 ) -> LocalizedLog:
-    """Place a log in the map of an earlier run, as ``scanchain localize`` does; nothing is printed.
+    """Localize a log in the map of an earlier run, as ``scanchain localize`` does; nothing is printed.
 
     prior : the run directory that holds the map
     Other arguments as in ``run``; without ``recording`` there is no report either.
@@ -188,8 +188,8 @@ def merge(
 
     runs : two or more; the map is in the frame of the first, whose poses stay as they are if ``fixed``
     update : whether points that newer sessions saw through are removed from the keyframes of older ones
-    Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that do not belong to the map
-    are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
+    Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that could not be joined
+    to the map are named there. Raises InputError for bad input, ScanchainError if no two runs can be joined.
     """
     from scanchain.sessions.merging import merge as merge_maps
     from scanchain_viz.recording.results import present_merge
@@ -217,13 +217,13 @@ def changes(
     recording: bool = True,
     force: bool = False,
 ) -> Changes:
-    """Compare two maps of one place, as ``scanchain changes`` does; nothing is printed.
+    """Compare two maps of the same place, as ``scanchain changes`` does; nothing is printed.
 
     earlier, later : run directories; None compares the newest session of a merged map with all before it
-    T_earlier_later : (d+1, d+1) where it is known; found by loop closures where left out
-    voxel_size_m : resolution; that of maps where left out. min_size_m : least length of a change
+    T_earlier_later : (d+1, d+1) if known; estimated from loop closures if omitted
+    voxel_size_m : resolution; that of the maps if omitted. min_size_m : smallest length of a change
     recording : whether report and recording are written
-    Returns points, labels and clusters. Raises InputError for bad input, and for maps that are not of one place.
+    Returns points, labels and clusters. Raises InputError for bad input, and for maps of different places.
     """
     from scanchain.sessions.change_run import compare_maps
     from scanchain_viz.recording.results import present_changes

@@ -33,10 +33,10 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind
 
 
 class Download(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="download"):
-    """A recording that others publish, in a form that ``scanchain convert`` takes.
+    """A recording published by others, in a format that ``scanchain convert`` reads.
 
     ``page`` is where its authors describe it. ``reference_url`` is its reference or calibration, empty
-    if there is nothing. Of an archive ``converts`` is the folder in it that becomes the log.
+    if there is none. ``converts`` is the folder of an archive that is converted to the log.
     """
 
     page: str
@@ -106,7 +106,7 @@ def prepare(name: str, folder: Path, *, force: bool = False, progress: Progress 
 
 
 def _download(name: str, source: Download, folder: Path, progress: Progress | None) -> Path:
-    """Download the recording and what belongs to it; the file or folder that is to be converted."""
+    """Download the recording and its reference; returns the file or folder to convert."""
     sha256 = "" if source.sha256 == "unknown" else source.sha256
     recording, reference = (folder / Path(urlsplit(url).path).name for url in (source.url, source.reference_url))
     fetch(source.url, recording, sha256=sha256, progress=progress)
@@ -118,7 +118,7 @@ def _download(name: str, source: Download, folder: Path, progress: Progress | No
     for archive in (recording, reference) if source.reference_url else (recording,):
         try:
             with zipfile.ZipFile(archive) as packed:
-                packed.extractall(unpacked)  # whatever the names of its files, they stay below that folder
+                packed.extractall(unpacked)  # which keeps all files below that folder, whatever their names
         except (zipfile.BadZipFile, OSError) as error:
             raise InputError(f"{archive}: does not unpack ({error}); delete it and call again") from error
     return unpacked / source.converts

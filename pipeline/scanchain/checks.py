@@ -1,7 +1,7 @@
-"""Arguments of public functions, checked where they enter: converted where nothing is lost, else one clear error.
+"""Checks of arguments of public functions: converted if nothing is lost, else refused with one clear error.
 
 Each function returns its argument as the kernels take it, C-contiguous, writeable and of one dtype (another layout
-would be compiled separately), or raises an InputError that names the argument, what came and what is wanted.
+would be compiled separately), or raises an InputError that names the argument, what was given and what is wanted.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from scanchain.kernels.geometry import largest_magnitude, rigidity_error
 from scanchain.kernels.voxels import REACH
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
-_LARGEST_VOXEL = float(1 << 31)  # of 32 bits, in which voxels are counted along an axis
-_MOST_WHOLE = 1 << 63  # whole numbers from which on 64 bits do not hold them
+_LARGEST_VOXEL = float(1 << 31)  # the index of a voxel along an axis has 32 bits
+_MOST_WHOLE = 1 << 63  # smallest whole number that does not fit into 64 bits
 _LATEST_S = 1e11  # latest stamp, seconds: the year 5138
 SMALLER_UNITS = " (from milliseconds: 1e-3 * stamp, microseconds: 1e-6, nanoseconds: 1e-9)"
 LARGEST = 1e50  # largest number in points, weights or a graph: products of a few are still finite
@@ -53,7 +53,7 @@ def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -
         array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
     if array.ndim != 2 or array.shape[1] != d:
         raise InputError(
-            f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
+            f"{name} has the shape {array.shape}; wanted (N, {d}), one row per point{_remedy(array, name, d)}"
         )
     farthest = largest_magnitude(array)
     if LARGEST < farthest < math.inf:
@@ -69,7 +69,7 @@ def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -
 def valid_points(
     value: object, name: str, d: int | None = None, *, dtype: DTypeLike = np.float64
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """The finite ones (M, d) of points, and which (N,) these are; the others are invalid returns of the lidar."""
+    """The finite points (M, d), and a mask (N,) of these; the others are invalid returns of the lidar."""
     d = dimension_of(value, name) if d is None else d
     if type(value) is np.ndarray and value.ndim == 2 and value.dtype.kind == "f" and not np.isfinite(value).all():
         is_valid = np.asarray(np.isfinite(value).all(axis=1))
@@ -85,7 +85,7 @@ def pose(value: object, name: str, d: int) -> NDArray[np.float64]:
     array = _shaped(_numbers(value, name, f"a ({n}, {n}) pose"), name, (n, n), wanted)
     error = rigidity_error(array)
     if not error <= _RIGID:
-        off = f"is no rigid transformation (off by {error:.2g})"
+        off = f"is not a rigid transformation (off by {error:.2g})"
         what = "holds NaN or infinite values" if math.isinf(error) else off
         raise InputError(f"{name} {what}; wanted [R t; 0 1] with RᵀR = I and det R = 1")
     return array
@@ -104,7 +104,7 @@ def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
 def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: float, name: str) -> None:
     """Refuse points that, moved by T, lie beyond what a voxel map can address."""
     at_most_m = math.sqrt(points.shape[1]) * largest_magnitude(points) + math.hypot(*T[:-1, -1].tolist())
-    if at_most_m < REACH * voxel_m:  # without moving them
+    if at_most_m < REACH * voxel_m:  # an upper bound, without moving them
         return
     farthest_m = largest_magnitude(points @ T[:-1, :-1].T + T[:-1, -1])
     if not farthest_m < REACH * voxel_m:
@@ -117,7 +117,7 @@ def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: fl
 def within_voxels(
     points: NDArray[np.floating], voxel_m: float, name: str, *, max_range_m: float = math.inf
 ) -> None:
-    """Refuse points within a range that lie so far away, or apart, in voxels that several would have one key."""
+    """Refuse points within a range that lie so far away or apart, in voxels, that voxels would share a key."""
     if max_range_m < REACH * voxel_m or largest_magnitude(points) < REACH * voxel_m:
         return
     used = points[np.linalg.norm(points, axis=1) <= max_range_m] if math.isfinite(max_range_m) else points
@@ -132,33 +132,33 @@ def within_voxels(
 
 
 def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
-    """Seconds (N,) of points relative to their scan's stamp; (0,), as None becomes, where there are none."""
+    """Seconds (N,) of points relative to their scan's stamp; (0,) for None or an empty array."""
     if value is None:
         return np.empty(0, np.float32)
     if type(value) is np.ndarray and value.dtype == np.float32 and value.shape == (0,):
         return value
     is_ready = _is_ready(value, np.float32)
-    array = _numbers(value, name, "seconds, one a point", np.float32 if is_ready else np.float64)
+    array = _numbers(value, name, "seconds, one per point", np.float32 if is_ready else np.float64)
     if array.shape != (0,):
-        _shaped(array, name, (count,), f"({count},), one a point, or None")
+        _shaped(array, name, (count,), f"({count},), one per point, or None")
     farthest_s = largest_magnitude(array)
     if not farthest_s <= LONGEST_SWEEP_S:
         raise InputError(
             f"{name}: a point lies {farthest_s:.3g} s from the stamp of its scan; wanted seconds after the stamp, "
-            f"at most {LONGEST_SWEEP_S:g} (from nanoseconds: 1e-9 * times; from absolute times: less the stamp)"
+            f"at most {LONGEST_SWEEP_S:g} (from nanoseconds: 1e-9 * times; from absolute times: minus the stamp)"
         )
     return array if is_ready else array.astype(np.float32)
 
 
 def truth(value: object, name: str) -> bool:
-    """True or False; texts and numbers are refused: "no" counts as true."""
+    """True or False; strings and numbers are refused: Python takes the string "no" as true."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     raise InputError(f"{name} is {shown(value)}; wanted True or False")
 
 
 def truths(value: object, name: str, count: int) -> NDArray[np.bool_]:
-    """Of each of so many, True or False (N,)."""
+    """Booleans (N,), one for each of ``count`` items."""
     array = _array(value, name, f"({count},) of True or False")
     if array.shape != (count,) or (array.dtype.kind != "b" and count):
         raise InputError(f"{name} is {shown(value)} of {_kind(array)}; wanted ({count},) of True or False")
@@ -196,7 +196,7 @@ def positive(value: object, name: str) -> float:
 
 
 def seconds(value: object, name: str) -> float:
-    """A stamp in seconds; nanoseconds of our time are refused."""
+    """A stamp in seconds; a present-day one in nanoseconds is refused."""
     if _is_number(value) and abs(value) < _LATEST_S:
         return float(value)
     raise InputError(f"{name} is {shown(value)}; wanted seconds, as a number below {_LATEST_S:.0e}{SMALLER_UNITS}")
@@ -204,7 +204,7 @@ def seconds(value: object, name: str) -> float:
 
 def weights(value: object, name: str, count: int) -> NDArray[np.float64]:
     """Weights (N,), finite and not negative."""
-    array = _shaped(_numbers(value, name, f"({count},) weights"), name, (count,), f"({count},), one a pair")
+    array = _shaped(_numbers(value, name, f"({count},) weights"), name, (count,), f"({count},), one per pair")
     if not ((array >= 0.0) & (array <= LARGEST)).all():
         raise InputError(
             f"{name} holds negative, NaN, infinite or huge values; wanted weights from 0 to {LARGEST:g}"
@@ -235,7 +235,7 @@ def indices(value: object, name: str) -> NDArray[np.int64]:
 
 
 def instance(value: object, kind: type, name: str, remedy: str) -> None:
-    """Refuse what is not of a kind."""
+    """Refuse a value of another type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} is {shown(value)}; wanted a {kind.__name__}: {remedy}")
 
@@ -249,9 +249,9 @@ def path(value: object, name: str) -> Path:
 
 @contextmanager
 def writing(path: Path, *, force: bool = True) -> Generator[None]:
-    """A context in which a path that takes no file, or none of this user, raises InputError.
+    """A context that raises InputError if a path cannot be written, for lack of a folder or of permission.
 
-    force : whether a file that is there may be replaced
+    force : whether an existing file may be replaced
     """
     if path.exists() and not force:
         raise InputError(f"{path}: exists; choose another name or pass --force to replace it")
@@ -283,7 +283,7 @@ def _numbers(value: object, name: str, wanted: str, dtype: DTypeLike = np.float6
     array = _array(value, name, wanted)
     if array.dtype.kind not in "iuf":
         raise InputError(f"{name} holds {_kind(array)}, not real numbers; wanted {wanted}")
-    with np.errstate(over="ignore"):  # what becomes infinite is refused as such
+    with np.errstate(over="ignore"):  # values that overflow to infinity are refused later
         return np.require(array, dtype, ["C_CONTIGUOUS", "WRITEABLE", "ALIGNED"]).view(np.ndarray)
 
 

@@ -15,10 +15,10 @@ _WARNING = "compiling kernels, once after an installation: the first calls take 
 
 
 class _Compilation(event.Listener):
-    """Compilation in this process: the time that it takes, and who is told of each module that it begins with.
+    """Listener to compilation in this process: measures its time, calls back with the module of each kernel.
 
-    Kernels that call others compile these within themselves. No garbage is collected meanwhile: a compiler makes
-    much that lasts.
+    Compilations are nested: a kernel compiles those that it calls. Garbage collection is off meanwhile, since most
+    of what a compiler allocates stays in use.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ event.register("numba:compile", _compilation)
 
 @contextmanager
 def standing_still() -> Iterator[None]:
-    """Count what is done meanwhile as compiling, in other processes."""
+    """Count the time spent within as compilation, which other processes do."""
     began_s = perf_counter()
     try:
         yield
@@ -75,7 +75,7 @@ def compiled_s() -> float:
 
 
 def working_s() -> float:
-    """Seconds as ``perf_counter`` has them, less those of compiling; only differences have a meaning."""
+    """Seconds of ``perf_counter`` minus the time of compilation; only differences are meaningful."""
     now_s = perf_counter()
     return (_compilation.began_s if _compilation.depth else now_s) - _compilation.ended_s
 

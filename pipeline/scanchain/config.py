@@ -48,7 +48,7 @@ Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-d
 
 
 class Section(Struct, frozen=True, forbid_unknown_fields=True):
-    """A branch of the configuration; made in Python it is checked like one read from a file."""
+    """A branch of the configuration; one made in Python is checked like one read from a file."""
 
     def __post_init__(self) -> None:
         """Convert what converts without loss. Raises InputError naming the key, its value and its limits."""
@@ -66,9 +66,9 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
         found automatically where empty
     ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
     upside_down : whether a planar lidar hangs upside down although no transform says so: its scans are mirrored
-    start_s : what comes before is left out, counted from the first message
-    end_s : what comes after is left out
-    every : every N-th scan is taken
+    start_s : everything before this time, counted from the first message, is skipped
+    end_s : everything after this time, counted from the first message, is skipped
+    every : only every N-th scan is used
     rate_hz : scan rate of a folder of clouds whose files are not named by their stamps; 0 where they are
     bin_columns : number of float32 columns of a cloud in a .bin file, x y z first
     max_bad_scans_percent : share of scans that may be malformed or empty, rounded up; such scans are left out
@@ -76,8 +76,8 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_range_m : returns nearer than this are dropped by the reader and counted
     max_range_m : returns farther than this are dropped by the reader and counted
     point_times : unit of the per-point times, or ``none``; ``clockwise`` or ``counterclockwise`` time the points
-        of a spinning lidar by azimuth, ``azimuth`` in the sense that fits better; ``auto`` does so where clouds
-        have no times and show clearly that it is right
+        of a spinning lidar by azimuth, ``azimuth`` in the direction that fits better; ``auto`` does so where
+        clouds have no times and the scans clearly support it
     revolution_s : duration of a revolution, for points timed by azimuth
     revolution_start_rad : azimuth at which a revolution begins, at the stamp; π is the rear
     """
@@ -146,7 +146,7 @@ class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """Scan-to-map alignment; the first scans, and those after a loss, are searched with the ``wide_`` limits.
+    """Scan-to-map alignment; the first scans, and those after a loss, are matched with the ``wide_`` limits.
 
     matcher : ``plicp``: point-to-plane or point-to-line by Levenberg-Marquardt; ``svd``: point-to-point in
         closed form
@@ -159,12 +159,12 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
         ``kernel_scale_m``
     tolerance_m : translation of a step below which an alignment has converged
     tolerance_rad : rotation of a step below which an alignment has converged
-    sensor_noise_m : least standard deviation of a range, which scales information and covariance; where the first
-        scans show a larger one, that counts, and widens voxels and kernel
+    sensor_noise_m : least standard deviation of a range, which scales information and covariance; a larger one
+        measured on the first scans replaces it, and enlarges voxels and kernel
     min_inlier_share : share of the points with a correspondence below which a scan is lost
     min_information : information per inlier, 0 to 1, below which a direction is degenerate
     min_signal : signal-to-noise ratio of the information below which a direction is degenerate,
-        noise being what errors of the map's normals alone would induce
+        where noise is the information that errors of the map's normals alone would induce
     """
 
     matcher: Matcher = "plicp"
@@ -188,10 +188,10 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
     prior : motion prediction: by wheel odometry, at constant velocity, or by the wheels where the log has them
     wheel_sigma_m : largest standard deviation of a translation predicted by the wheels; the usual one is
         estimated while running
-    wheel_sigma_rad : the same of a rotation
+    wheel_sigma_rad : the same for a rotation
     velocity_sigma_m : largest standard deviation of a translation predicted at constant velocity; the usual
         one is estimated while running
-    velocity_sigma_rad : the same of a rotation
+    velocity_sigma_rad : the same for a rotation
     max_speed_m_s : speed of the robot, which limits how far a planar scan that matched badly is searched for,
         and any scan after a gap
     max_turn_rad_s : turn rate of the robot, which limits the heading of searches in the plane and from above
@@ -218,13 +218,13 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """Loop closing: proposal and verification of revisits.
 
     enabled : whether loops are closed
-    drift : drift of the odometry in meters a meter, which sets the search radius along the shortest path of
+    drift : drift of the odometry in meters per meter, which sets the search radius along the shortest path of
         the graph
     min_radius_m : smallest search radius
     max_radius_m : largest search radius, and largest correction by one closure
-    min_travel_m : path length between two keyframes from which on they may close a loop
-    min_overlap : share of the points on surfaces of the submap from which on a closure is accepted
-    min_information : information per inlier of the worst direction from which on a closure is accepted
+    min_travel_m : shortest path between two keyframes that may close a loop
+    min_overlap : smallest share of the points on surfaces of the submap with which a closure is accepted
+    min_information : smallest information per inlier of the worst direction with which a closure is accepted
     edge_sigma_m : translational standard deviation added to that of a loop edge
     edge_sigma_rad : rotational standard deviation added to that of a loop edge
     recognizer : proposes places seen before, however far the map has drifted: "auto" ("outline", the
@@ -254,7 +254,7 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     max_iterations : limit of the iterations
     tolerance : relative change of χ², step length, and relative gradient below which it has converged
     robust : loss of loop edges; ``truncated`` also gives each of them a verdict, by graduated non-convexity
-    robust_scale : normalized error from which on the loss gives way, in standard deviations
+    robust_scale : normalized error above which the loss downweights an edge, in standard deviations
     """
 
     optimizer: Literal["levenberg-marquardt", "gauss-newton", "gradient-descent"] = "levenberg-marquardt"
@@ -268,11 +268,11 @@ class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """The maps that are written at the end.
 
     voxel_size_m : edge length of the voxels of the point cloud, which has one point in each
-    remove_moving : whether points are left out that other scans looked through
+    remove_moving : whether points that other scans saw through are removed
     write_pcd : whether the point cloud is also written as ``map.pcd``
     write_laz : whether the point cloud is also written as ``map.laz``
     grid_resolution_m : edge length of a cell of the occupancy grid
-    grid_max_range_m : range up to which a beam is drawn into the occupancy grid
+    grid_max_range_m : range up to which beams are traced into the occupancy grid
     slice_min_z_m : lower limit of the slice that the occupancy grid of a 3D log shows, relative to the lidar
     slice_max_z_m : upper limit of that slice
     """
@@ -290,8 +290,8 @@ class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):
 class RecordingConfig(Section, frozen=True, forbid_unknown_fields=True):
     """Contents of the rerun recording.
 
-    local_map_every : keyframes between two drawings of the local map
-    max_map_points : points drawn of the local map, and at least as many of the final map
+    local_map_every : keyframes between two recordings of the local map
+    max_map_points : largest number of points recorded of the local map; that of the final map is no less
     """
 
     local_map_every: Count = 20
@@ -299,12 +299,12 @@ class RecordingConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class OutputsConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """Files of a run directory beside those that are always there.
+    """Optional files of a run directory.
 
     mcap : whether ``results.mcap`` is written: poses and maps as ROS 2 messages
     map : whether the folder ``map`` is written, which other logs are localized in and merged with
-    error_bars : quick leaves out the systematic errors, for which full runs odometry once more without each of
-        several groups of directions, on a whole short log or parts of a long one
+    error_bars : quick omits the systematic errors; full estimates them by running odometry once more without each
+        of several groups of directions, on all of a short log or parts of a long one
     """
 
     mcap: bool = False

@@ -49,7 +49,7 @@ class ConfigKey:
         return next((unit for ending, unit in _UNITS.items() if self.name.endswith(ending)), "")
 
     def check(self, value: object, source: str, *, text: str = "") -> Value:
-        """The value as this key holds it; ``source``, a file or a flag, is named in the error."""
+        """The value converted to the type of this key; ``source``, a file or a flag, is named in the error."""
         try:
             given = float(value) if isinstance(value, Real) and not isinstance(value, bool) else value
             converted: Value = msgspec.convert(given, self.kind, strict=not isinstance(given, float))

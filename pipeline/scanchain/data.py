@@ -25,11 +25,11 @@ RawPoints = NDArray[np.float32]
 AnyPoints = NDArray[np.floating]  # as arguments, converted where they enter
 Matrix = NDArray[np.float64]
 
-_set = object.__setattr__  # of a record that checks itself
+_set = object.__setattr__  # sets a field of a frozen record that checks itself
 _SHOWN = 60  # longest text of a value in the ``repr`` of a record
 
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
-MOST_COPIES = 5  # largest number of equal scans in a row that a driver which publishes too often leaves
+MOST_COPIES = 5  # largest number of identical scans in a row that a driver that publishes too often produces
 
 _WHOLE = (
     ("index", "the number of the scan, from 0", 0),
@@ -40,7 +40,7 @@ _WHOLE = (
 
 
 def brief(self: object) -> str:
-    """A record on one line, for its ``repr``: arrays by their shape, what is long by its kind and number."""
+    """A record on one line, for its ``repr``: arrays by their shape, long values by their type and length."""
     names = getattr(self, "__dataclass_fields__", ()) or getattr(self, "__struct_fields__", ())
     values = ((name, getattr(self, name)) for name in names)
     return f"{type(self).__name__}({', '.join(f'{name}={_brief(value)}' for name, value in values)})"
@@ -65,7 +65,7 @@ class OtherPoints(NamedTuple):
 class Scan:
     """One scan as the log holds it, invalid returns removed.
 
-    index : place of the scan in the order of log time, from 0
+    index : position of the scan in the order of log time, from 0
     stamp_ns : header stamp; the instant at which the scan's pose holds
     log_time_ns : when it was recorded; scans are processed in this order
     points : (N, d) float32, meters, lidar frame
@@ -73,11 +73,11 @@ class Scan:
     dropped : returns removed because they were NaN, infinite or out of range
     T_odom_base : pose of the robot in the wheel-odometry frame at ``stamp_ns``; None where the log has none
     waited_s : seconds that the reader of the log made its consumer wait for this scan
-    is_copy : whether its points are those of the scan before in the log, to the last bit
-    clock_jump_s : jump of the stamp since the scan before that no time passed for; 0 as a rule
-    others : what other lidars that publish on the topic saw just before; None as a rule
+    is_copy : whether its points are bitwise equal to those of the previous scan in the log
+    clock_jump_s : jump of the stamp since the previous scan for which no time passed; usually 0
+    others : points of other lidars that publish on the topic, measured just before; usually None
 
-    Arrays are converted where nothing is lost; InputError where a shape, a dtype or a value is none of these.
+    Arrays are converted if nothing is lost; any other shape, dtype or value raises InputError.
     """
 
     __repr__ = brief
@@ -94,8 +94,8 @@ class Scan:
     others: OtherPoints | None = None
 
     def __post_init__(self) -> None:
-        """Check and convert; the class is frozen, so that what was checked stays so."""
-        from scanchain import checks  # compiled: whoever reads --help makes no scan
+        """Check and convert; the class is frozen, so that the checks stay valid."""
+        from scanchain import checks  # imports compiled kernels, which --help does not need
 
         for name, wanted, least in _WHOLE:
             _set(self, name, checks.integer(getattr(self, name), name, wanted, least=least))
@@ -146,7 +146,7 @@ class Prior(NamedTuple):
 
     T_target_source : (d+1, d+1) the expected pose
     covariance : (k, k) of a twist ξ in the source's own frame, T exp(ξ); m², rad m, rad²
-    widest : (k,) standard deviations that hold whatever happens, as when the vehicle brakes
+    widest : (k,) standard deviations that hold in every case, for example when the vehicle brakes
     is_measured : True where another sensor measured the motion, False where it is extrapolated
     """
 
@@ -168,28 +168,28 @@ class Match:
     T_target_source : (d+1, d+1) pose of the source in the target's frame
     information : (k, k) inverse covariance of a twist ξ in the source's own frame, T exp(ξ), as a pose-graph
         edge takes it; m⁻², rad⁻¹m⁻¹, rad⁻²
-    cost : robust cost in m², each point without correspondence at the kernel's limit; compares two alignments of
-        the same scan to the same map
+    cost : robust cost in m², each point without correspondence counted at the kernel's limit; compares two
+        alignments of the same scan to the same map
     inliers : source points with a correspondence within ``matching.max_distance_m``, also after a wide search
-    points : source points that were tried
+    points : number of source points
     iterations : linearizations used
     residual_m : root of the weighted mean squared residual over the inliers
     fit : share of the information that the robust kernel leaves to the direction that loses most: near 1 where the
         correspondences agree with the pose, below 0.6 where those that determine a direction contradict it
     at_minimum : whether the last step was below the tolerance
     converged : whether the pose is a minimum that the points fit (``inlier_share`` and ``fit``) and that is
-        determined in every direction (``observability``)
+        observable in every direction (``observability``)
     reason : why it did not converge, in words
     degeneracy_eigenvalue : smallest eigenvalue of the information per inlier, lengths scaled so that
-        translation and rotation compare; 0 is blind, 1 is a direction that every residual sees
-    observability : of the worst direction, how many times as much is known of it as it takes to be determined, by
-        ``matching.min_information`` and ``matching.min_signal``; below 1 the scan is degenerate
+        translation and rotation compare; 0 is unobservable, 1 is a direction that every residual constrains
+    observability : of the worst direction, ratio of its information to the least that ``matching.min_information``
+        and ``matching.min_signal`` require; below 1 the scan is degenerate
     degeneracy_direction : (k,) unit eigenvector of the worst direction, twist order, source's frame
     cause : the reason without its figures, the same for all of its kind
-    variance_factor : of ``covariance`` against the inverse of ``information``, at most 1: in the plane the latter
-        counts ``matching.sensor_noise_m`` where residuals are smaller
-    systematic : (k, k) covariance in the source's own frame by how eight sectors of the scan disagree, which
-        poses aligned to the same map have in common; (0, 0) from a matcher that does not say
+    variance_factor : ratio of ``covariance`` to the inverse of ``information``, at most 1: in the plane the latter
+        assumes ``matching.sensor_noise_m`` where residuals are smaller
+    systematic : (k, k) covariance in the source's own frame of errors that poses aligned to the same map have in
+        common, by the disagreement of eight sectors of the scan; (0, 0) from a matcher without an estimate
     """
 
     __repr__ = brief
@@ -223,18 +223,18 @@ class Match:
 
     @property
     def is_fit(self) -> bool:
-        """True if the pose is a minimum that the correspondences agree with, in every direction or not."""
+        """True if the pose is a minimum that the correspondences agree with, observable everywhere or not."""
         return self.at_minimum and self.fit >= LEAST_FIT
 
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """Twists by which motions differ without each of G groups of directions, in the frame of the later scan.
+    """Changes of motions when each of G groups of directions is left out: twists in the later scan's frame.
 
     of_keyframes : (G, K−1, k) from each keyframe to the next
     of_scans : (G, N, k) from the last keyframe to each scan
     is_measured : (N,) whether both were measured; other motions are extrapolated
-    kinds : (G,) of the group: 0 of azimuths, 1 of elevations
+    kinds : (G,) kind of each group: 0 for azimuths, 1 for elevations
     """
 
     of_keyframes: Matrix
@@ -244,11 +244,11 @@ class Influence:
 
 
 class KeyframeErrors(NamedTuple):
-    """Errors of a keyframe's pose against the map, and of the map since the keyframe before.
+    """Errors of a keyframe's pose relative to the map, and of the map since the previous keyframe.
 
     variance_factor : of the covariance by the residuals, as in ``Match``
-    systematic : (k, k) covariance by how sectors of the scans disagree, of a twist in the lidar's own frame
-    renewal : share of the map that the lidar exchanged for another since the keyframe before, 0 to 1
+    systematic : (k, k) covariance of a twist in the lidar's own frame, by the disagreement of sectors of the scans
+    renewal : share of the map in the lidar's view that is new since the previous keyframe, 0 to 1
     """
 
     variance_factor: float
@@ -266,15 +266,15 @@ class KeyframePoints(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A scan that stands in the pose graph.
+    """A scan that is a node of the pose graph.
 
     index : its number in the graph
     scan_index, stamp_ns : the scan it was made of
     stored : its points, which ``points`` reads
     T_odom_lidar : pose in the odometry frame
     traveled_m : length of the path up to it, by odometry
-    scale : of the voxels that odometry used there, 1 for those of the configuration; finer ones of dense scans are
-        not counted, so that places compare whatever lidar saw them
+    scale : factor on the voxel sizes that odometry used there, 1 for those of the configuration; without that of
+        dense scans, so that places seen by different lidars are comparable
     noise_m : standard deviation of its ranges where it is above ``matching.sensor_noise_m``, else 0
     """
 
@@ -305,7 +305,7 @@ class Problem(NamedTuple):
 
     @classmethod
     def plain(cls, text: str) -> Problem:
-        """One without figures."""
+        """A problem without figures."""
         return cls(text, text)
 
 
@@ -333,8 +333,8 @@ class Closure:
     ``match.T_target_source`` is the pose of keyframe ``source`` in the frame of keyframe ``target``.
     ``overlap`` is the share of source points that lie on the target's surfaces after matching. ``cause`` is the
     reason without its figures, the same for all closures of its kind. ``chi2_before`` is its χ² in the graph as it
-    was before it became an edge, NaN if it never did; ``weight`` and ``chi2_after`` are what the optimizer left to
-    the edge in the end: 0 and NaN if there is none, 1 and NaN until it is optimized.
+    was before it became an edge, NaN if it never did; ``weight`` and ``chi2_after`` are the final
+    robust weight and χ² of the edge: 0 and NaN if there is none, 1 and NaN until it is optimized.
     """
 
     __repr__ = brief
@@ -358,7 +358,7 @@ class Closure:
         return VERIFICATION if math.isnan(self.chi2_after) else BACK_END
 
     def rejected(self, problem: Problem) -> Closure:
-        """The same, rejected."""
+        """The same closure, rejected."""
         return replace(self, verdict=ClosureVerdict.REJECTED, cause=problem.cause, reason=problem.text)
 
 
@@ -371,12 +371,12 @@ class GraphState:
 
     poses : (K, d+1, d+1) T_world_lidar of every keyframe
     stamps_ns : (K,) int64
-    edges : (E, 2) int64 keyframe pairs (i, j), loops last; i is −1 of what one keyframe measures by itself
+    edges : (E, 2) int64 keyframe pairs (i, j), loops last; i is −1 for a prior on a single keyframe
     is_loop : (E,) bool
     weight : (E,) robust weight in [0, 1] that the optimizer left to each edge; 1 for odometry
     chi2 : Σ w eᵀΩe of the edges in force: all but the rejected ones
     edge_chi2 : (E,) eᵀΩe of each edge, without its robust weight
-    degrees_of_freedom : numbers that the edges in force measure, less those that they are to determine
+    degrees_of_freedom : number of measured values of the edges in force, minus that of the unknowns
     """
 
     __repr__ = brief
@@ -396,7 +396,7 @@ class GraphState:
 
 
 def fit_text(chi2: float, degrees_of_freedom: int, rejected: str, *, has_loops: bool) -> str:
-    """Fit of the edges in force as text: χ², its degrees of freedom, how many edges do not count.
+    """Fit of the edges in force as text: χ², its degrees of freedom, number of rejected edges.
 
     rejected : how many edges are not in force, in words; empty for none
     Loops that measure too little to leave degrees of freedom have a χ² all the same: see ``has_loops``.
@@ -425,7 +425,7 @@ class Step:
     scan : the scan itself
     points : (M, d) float64 deskewed, downsampled points that were matched, lidar frame
     T_odom_lidar : pose before optimization: smooth, drifts
-    T_world_lidar : best pose known now: jumps at closures
+    T_world_lidar : current best estimate; jumps at closures
     match : the registration against the local map
     state, reason : reliability of the pose, and the reason if it is not ok
     keyframe : index of the keyframe made of this scan, -1 if none was

@@ -28,9 +28,9 @@ class DownloadError(ScanchainError):
 def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress | None = None) -> None:
     """Download a file unless it exists, resuming an earlier try.
 
-    sha256 : the expected one, empty where unknown. Raises InputError where it is not, and for what is no
-        HTTP address; DownloadError where the server does not respond as it should.
-    progress : called with the MiB received and their total, 0 where unknown
+    sha256 : the expected hash, empty if unknown
+    progress : called with the MiB received and their total, 0 if unknown
+    Raises InputError if the hash differs or the address is not of HTTP; DownloadError if the download fails.
     """
     if urlsplit(url).scheme not in ("http", "https"):
         raise InputError(f"{url}: is no address of a web server; give one with http:// or https://")

@@ -4,7 +4,7 @@ import sys
 
 
 def main() -> int:
-    """Import the command line and run it; 1 where Ctrl-C came before it was there, as after."""
+    """Import the command line and run it; 1 if Ctrl-C interrupts the import, as for later interruptions."""
     try:
         from scanchain.__main__ import main as run
 

@@ -1,4 +1,4 @@
-"""The errors a user can cause or meet, and the words of their lines: values, numbers, remedies."""
+"""Errors that a user can cause or meet, and the formatting of their messages: values, numbers, remedies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import shutil
 import textwrap
 from collections.abc import Iterable
 
-_OPTION = re.compile(r"scanchain [^;,()]*|--([a-z][\w.-]*\w)")  # commands, and arguments of the one that runs
+_OPTION = re.compile(r"scanchain [^;,()]*|--([a-z][\w.-]*\w)")  # commands stay, options become Python arguments
 _KEYWORDS = {name: name for name in ("out", "config", "methods", "rpe")} | {
     "force": "force=True", "gt": "ground_truth", "max-gap": "max_gap_s", "start": "log__start_s",
     "end": "log__end_s", "every": "log__every", "topic": "log__topic",
@@ -35,7 +35,7 @@ class InputError(ScanchainError):
 
 
 class OwnCodeError(InputError):
-    """Code of the user's own raised an error, which is the cause, or returned something else than is wanted."""
+    """User-defined code raised an error, which is the cause, or returned something unexpected."""
 
 
 class MissingExtraError(InputError):
@@ -60,7 +60,7 @@ def shown(value: object) -> str:
 
 
 def printable(text: str) -> str:
-    """The text on one line; line breaks, escapes of terminals and marks of direction as Python writes them."""
+    """The text on one line; line breaks, terminal escapes and bidirectional marks are escaped as in Python."""
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
@@ -79,7 +79,7 @@ _REMEDIES = {
     errno.ENOSPC: _NO_SPACE,
     errno.EDQUOT: "the quota of the disk is used up; free some space on it, or write to another one",
     errno.EFBIG: "File too large: raise the limit of file sizes (ulimit -f), or write to another disk",
-    errno.ENAMETOOLONG: "the name is longer than the file system takes (255 bytes a part); shorten it",
+    errno.ENAMETOOLONG: "the name is longer than the file system takes (255 bytes per part); shorten it",
     errno.EROFS: "the file system is read-only; write to another one",
     errno.EACCES: "access is denied; check the permissions",
 }
@@ -91,7 +91,7 @@ def remedy_of(error: OSError) -> str:
     return f"{error.filename}: {remedy}" if error.filename and remedy else remedy
 
 
-_SHOWN = 3  # of lines that are alike
+_SHOWN = 3  # number of lines shown of those that differ only in numbers
 _LABEL = re.compile(r" *(\S+( \S+)* {2,}){1,2}| +")  # names before the text of a line
 FREEDOM = ("degree of freedom", "degrees of freedom")
 
@@ -102,7 +102,7 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 
 def below(value: float) -> str:
-    """A value that is below a limit, two digits rounded down: it never reads like the limit."""
+    """A value that is below a limit, two digits rounded down, so that it never reads like the limit."""
     return f"{math.floor(100.0 * value) / 100.0:.2f}"
 
 
@@ -121,7 +121,7 @@ def duration(time_s: float) -> str:
 
 
 def folded(text: str) -> str:
-    """Text with lines no longer than the terminal, else 100; the rest of one stands below, behind its label."""
+    """Text wrapped to the width of the terminal, else 100; continuation lines are indented past the label."""
     wrapper = textwrap.TextWrapper(shutil.get_terminal_size((100, 25)).columns, break_long_words=False)
     wrapper.break_on_hyphens, folds = False, list[str]()
     for line in text.split("\n"):
@@ -132,7 +132,7 @@ def folded(text: str) -> str:
 
 
 def grouped(lines: Iterable[str]) -> list[str]:
-    """The lines in order; of many that differ in numbers alone the first ones, and how many more there are."""
+    """The lines by order of their first; of those that differ only in numbers three, and the number of others."""
     kinds: dict[str, list[str]] = {}
     for line in lines:
         kinds.setdefault(re.sub(r"\d+", "#", line), []).append(line)

@@ -1,4 +1,4 @@
-"""Files: where a log lies, and writing that is complete or not there."""
+"""Files: the path or address of a log, and atomic writing."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Address:
         return PurePosixPath(self.name).stem
 
     def resolve(self) -> Address:
-        """Itself: it is the same from everywhere."""
+        """Itself: an address does not depend on the working directory."""
         return self
 
 
@@ -40,7 +40,7 @@ Source = Path | Address
 
 
 def without_keys(words: Sequence[str]) -> list[str]:
-    """The words of a command line, addresses as they may be shown."""
+    """The words of a command line, addresses without password and query."""
     return [str(source_of(word)) if "://" in word else word for word in words]
 
 
@@ -58,7 +58,7 @@ def source_of(named: Source | str) -> Source:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file; what was there before stays until all of the new one is on disk.
+    """Write a file atomically: the old one stays until the new one is complete on disk.
 
     Raises OSError of ``path``.
     """

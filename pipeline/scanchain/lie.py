@@ -17,7 +17,7 @@ _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 
 
 def identity(dimension: int) -> Pose:
-    """The pose that moves nothing."""
+    """The identity pose."""
     return np.eye(dimension + 1)
 
 

@@ -1,4 +1,4 @@
-"""Where the segments of a log lie: joined to each other, and to a prior map if they were recorded in it."""
+"""Placement of the segments of a log relative to each other, and in a prior map if they were recorded there."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ _TOO_FEW = Problem.plain("too few keyframes agree on the place")
 _CONTRADICTED = Problem.plain("withdrawn: later scans contradict the location")
 _REPLACED = Problem.plain("withdrawn: more of the path matches at another location in the map")
 _ELSEWHERE = Problem.plain("contradicts the location of the log in the map, at which more of the path matches")
-_DRIFT = 0.1  # largest distance of a find from the predicted pose, as a share of the path since the last match
-LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
+_DRIFT = 0.1  # largest distance of a match from the predicted pose, as a share of the path since the last match
+LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, largest of an edge: with less information a pose is lost to rounding
 
 
 class Placement:
-    """Takes closures into the graph, and with them finds where the newest segment of the log lies.
+    """Adds closures to the graph, and determines by them where the newest segment of the log lies.
 
-    Closures of a new segment to older keyframes, of segments before or of a prior map, which come first and are
-    fixed, wait until they are evidence enough. Then the segment is moved there. Those that later scans contradict
-    are withdrawn. While a log that was joined to a map does not match it, other locations are searched for and
-    tested in parallel; one that more of the path matches replaces that of the log, its earlier scans included.
+    Closures of a new segment with older keyframes (of earlier segments, or of a prior map, which come first and
+    are fixed) are held back until the sequential test accepts them. Then the segment is moved there. Closures that
+    later scans contradict are withdrawn.
+
+    While a log that was joined to a map does not match it, other locations are searched for and tested in
+    parallel; one that more of the path matches replaces that of the log, its earlier scans included.
     """
 
     def __init__(
@@ -42,11 +44,11 @@ class Placement:
         self.first = 0  # number of the first keyframe of the log, after those of the map
         self.evidence = PlaceTest(closer.segments)
         self.rival = PlaceTest(closer.segments)  # of another location in the map, while the log has no match
-        self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
+        self.by_map: Closure | None = None  # the closure with the map of the newest keyframe that has one
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
 
     def begin_in(self, count: int) -> None:
-        """Begin in a map: so many keyframes, the first ones, stay where they are."""
+        """Begin in a map, whose ``count`` keyframes come first and stay fixed."""
         self.first = count
 
     @property
@@ -56,7 +58,7 @@ class Placement:
         return self.first > 0 and not self.evidence.is_gathering and bool(components[-1] == components[0])
 
     def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
-        """Join the first scan of the log to the nearest keyframe of the map: it is at this pose, to m and rad."""
+        """Join the first scan of the log to the map's nearest keyframe, by its pose and sigmas (m, rad)."""
         positions = self.graph.poses[: self.first, :-1, -1]
         nearest = int(np.argmin(np.linalg.norm(positions - T_world_lidar[:-1, -1], axis=1)))
         T_nearest_lidar = lie.between(self.graph.poses[nearest], T_world_lidar)
@@ -68,7 +70,7 @@ class Placement:
         self.follow_graph()
 
     def close(self, *, is_keyframe: bool) -> tuple[Closure, ...]:
-        """Closures by what the scan completes, and of the newest keyframe if the scan is one."""
+        """Closures of searches that this scan completes, and of the newest keyframe if the scan is one."""
         if self.evidence.is_in_vain(self.keyframes[-1]):
             self.give_up()
         if self.rival.is_in_vain(self.keyframes[-1]) and not self.rival.is_accepted:
@@ -86,7 +88,7 @@ class Placement:
         return closures
 
     def take(self, closures: tuple[Closure, ...], at_rival: tuple[Closure, ...] = ()) -> tuple[Closure, ...]:
-        """Keep closures; those accepted become edges of the graph.
+        """Record closures; those accepted become edges of the graph.
 
         at_rival : tried at the other location in the map that is being tested
         """
@@ -100,7 +102,7 @@ class Placement:
         return taken
 
     def optimize(self, *, is_live: bool) -> GraphState | None:
-        """Optimize the graph if it is time; the graph as it is then, where more than its end moved."""
+        """Optimize the graph if it is due; returns its state if more than its end moved, else None."""
         if self.evidence.is_gathering:
             return None
         moved = len(self.graph) - self.schedule.advance(is_live=is_live)
@@ -109,7 +111,7 @@ class Placement:
         return self.graph.state() if moved > LAG or moved == len(self.graph) else None
 
     def predict(self, T_odom_last: Pose, T_odom_next: Pose) -> Pose:
-        """T_world of the next keyframe by the last one, its odometry corrected by the drift that loops show."""
+        """T_world of the next keyframe by the last one and odometry, corrected by the drift that loops show."""
         if self.graph.drift.any():
             T_last_next = self.graph.predicted(lie.between(T_odom_last, T_odom_next))
             self.T_world_odom = lie.normalize(self.graph.poses[-1] @ T_last_next @ lie.inverse(T_odom_next))
@@ -122,19 +124,19 @@ class Placement:
         self.closer.start_segment(keyframe)
 
     def finish(self) -> None:
-        """Take the last closures; what is being tested then has too little evidence."""
+        """Record the last closures; a location still being tested has too little evidence and is rejected."""
         self.take(self.closer.finish(self.keyframes, self.graph))
         self.give_up()
 
     def give_up(self) -> None:
-        """The pose that is being tested, if any, is wrong: search the newest segment again."""
+        """Reject the location that is being tested, if any; search for that of the newest segment again."""
         if self.evidence.is_gathering:
             self.evidence.drop(self.closer.segments.starts[-1])
             self.closer.segments.assume(-1)
             self.closer.search_again()
 
     def set_apart(self) -> bool:
-        """Reject what joins segments to older ones where it is too little in the end; True if any is."""
+        """Reject closures that join segments to older ones with too little evidence in the end; True if any is."""
         segments, graph, is_any = self.closer.segments, self.graph, False
         targets, sources = graph.edges[graph.is_loop & ~graph.is_rejected].T
         for start in segments.starts[1:]:
@@ -147,12 +149,12 @@ class Placement:
         return is_any
 
     def follow_graph(self) -> None:
-        """Put the odometry frame where the graph has the newest keyframe."""
+        """Set T_world_odom by the pose of the newest keyframe in the graph."""
         T_lidar_odom = lie.inverse(self.keyframes[-1].T_odom_lidar)
         self.T_world_odom = lie.normalize(self.graph.poses[-1] @ T_lidar_odom)
 
     def _tested(self, closures: tuple[Closure, ...], at_rival: tuple[Closure, ...]) -> tuple[Closure, ...]:
-        """Closures; those that would join the newest segment to older ones are rejected until they are enough."""
+        """Closures; those that would join the newest segment to older ones are rejected until the test accepts."""
         start, evidence, world = self.closer.segments.starts[-1], self.evidence, (self.keyframes, self.graph.poses)
         closures, found = self._told_apart(closures)
         elsewhere = found + at_rival
@@ -181,7 +183,7 @@ class Placement:
         return (*others, *(each.rejected(_ELSEWHERE) for each in found), *(joining or alone))
 
     def _told_apart(self, closures: tuple[Closure, ...]) -> tuple[tuple[Closure, ...], tuple[Closure, ...]]:
-        """Closures, and among them finds in the map far from where the log is taken to be and has no match."""
+        """Closures in two groups: others, and those far from the log's location in the map, if it has no match."""
         if not self.first or self.closer.is_tracking(self.keyframes):
             return closures, ()
         components = self.closer.segments.components(self.graph)
@@ -205,7 +207,7 @@ class Placement:
         return self.closer.near.in_map_at(T_world, self.keyframes)
 
     def _withdrawn(self, closures: tuple[Closure, ...], problem: Problem) -> tuple[Closure, ...]:
-        """The newest segment is not where it was joined to older ones: take back all of that; search again."""
+        """Withdraw all closures that joined the newest segment to older ones; search for its location again."""
         start = self.closer.segments.starts[-1]
         is_taken_back = self._take_back(range(start, len(self.keyframes)), problem)
         self.evidence.drop(start)
@@ -218,7 +220,7 @@ class Placement:
         return tuple(each.rejected(problem) if is_taken_back(each) else each for each in closures)
 
     def _take_back(self, segment: range, problem: Problem) -> Callable[[Closure], bool]:
-        """Reject the closures that join the keyframes of a segment to older ones; tells which these are."""
+        """Reject the closures that join the keyframes of a segment to older ones; returns the test for these."""
 
         def is_meant(closure: Closure) -> bool:
             is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
@@ -246,7 +248,7 @@ class Placement:
         return replace(closure, chi2_before=chi2_before)
 
     def _move_to(self, closure: Closure) -> None:
-        """Put the newest segment where its first closure says: from far off, robust losses reject all of them."""
+        """Move the newest segment to where its first closure puts it: from afar, robust losses reject all."""
         self.schedule.stop()  # it would put the segment back
         T_world_source = self.graph.poses[closure.target] @ closure.match.T_target_source
         start, T_old = self.closer.segments.starts[-1], self.graph.poses[closure.source]
@@ -255,7 +257,7 @@ class Placement:
     def _move(self, start: int, T_new_old: Pose) -> None:
         self.graph.move(start, lie.normalize(T_new_old))
         if start == self.first:
-            self.graph.remeasure(0)  # the edge that the log hangs on: where it began in the map was not known
+            self.graph.remeasure(0)  # the edge that joins the log to the map: its start in the map was unknown
 
 
 def loop_information(closure: Closure, config: LoopsConfig) -> Matrix:

@@ -1,4 +1,4 @@
-"""Classes of the user's own, named as ``module:Class`` in a configuration key."""
+"""User-defined classes, named as ``module:Class`` in a configuration key."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def is_class_name(text: str) -> bool:
 def load(name: str, *methods: str) -> type:
     """The class that ``module:Class`` names: installed, on PYTHONPATH or else in the working directory.
 
-    The working directory joins the search path only for a module of the user's, as the last: until then nothing
-    that happens to lie there is imported. Raises InputError where there is no such module or class, or the class
+    The working directory is appended to the search path only for a user's module: before that, nothing that
+    happens to lie there is imported. Raises InputError where there is no such module or class, or the class
     lacks one of the methods.
     """
     module_name, _, class_name = name.partition(":")
@@ -54,7 +54,7 @@ def load(name: str, *methods: str) -> type:
 
 @contextmanager
 def own_code(where: str) -> Iterator[None]:
-    """Raise an OwnCodeError that says where, for whatever goes wrong in code of the user's own."""
+    """Convert every error of user-defined code into an OwnCodeError that says where."""
     try:
         yield
     except InputError as error:
@@ -64,7 +64,7 @@ def own_code(where: str) -> Iterator[None]:
 
 
 def _located(error: Exception) -> str:
-    """Kind and message of an error, with the line of the user's own code that led to it, where one did."""
+    """Kind and message of an error, with the line of user-defined code that led to it, if any."""
     ours = (str(Path(__file__).parent), importlib.__file__, "<frozen ")
     own = [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith(ours)]
     lines = [f' (File "{e.filename}", line {e.lineno}, in {e.name})' for e in own if e.filename == own[0].filename]

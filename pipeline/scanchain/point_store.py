@@ -17,20 +17,20 @@ from numpy.typing import NDArray
 from scanchain.errors import InputError
 
 _NUMBER = np.dtype("<f4")  # as lidars give them
-_MOST_WAITING = 1 << 18  # bytes that are gathered before they are written together
+_MOST_WAITING = 1 << 18  # size of the write buffer, bytes
 
 
 class PointStore:
-    """Grows by one scan after the other; what is in it never changes.
+    """Append-only store of the points of scans.
 
     dimension : 2 or 3, of the points
-    rows : points that are in it
-    waiting : bytes of the last of them, which are not in the file yet
-    crc : CRC-32 of those that are
+    rows : number of points in it
+    waiting : bytes of the last of them, not yet written to the file
+    crc : CRC-32 of the bytes written
     """
 
     def __init__(self, dimension: int, path: Path | None = None) -> None:
-        """Path : of the file; without one it has no name and goes with the process."""
+        """Path : of the file; None for a temporary file, deleted when the process ends."""
         self.dimension = dimension
         self.rows = 0
         self.waiting = bytearray()
@@ -38,7 +38,7 @@ class PointStore:
         self._take(_nameless() if path is None else path.open("w+b", buffering=0))
 
     def add(self, points: NDArray[np.floating]) -> StoredPoints:
-        """Take points (N, d), meters. Raises OSError where the disk is full."""
+        """Append points (N, d), meters. Raises OSError where the disk is full."""
         stored = StoredPoints(self, self.rows, len(points))
         self.waiting += points.astype(_NUMBER).tobytes()
         self.rows += len(points)
@@ -47,7 +47,7 @@ class PointStore:
         return stored
 
     def flush(self) -> None:
-        """Write the points that wait. Raises OSError where the disk is full."""
+        """Write the buffered points. Raises OSError where the disk is full."""
         if self.waiting:
             self.file.seek(self.rows * self._row_bytes - len(self.waiting))
         while self.waiting:
@@ -56,7 +56,7 @@ class PointStore:
             del self.waiting[: len(written)]
 
     def read(self, first: int, count: int) -> NDArray[np.float32]:
-        """(count, d) points from one row on, in any thread. Raises InputError where the file has lost them."""
+        """(count, d) points from one row on, in any thread. Raises InputError if the file is too short."""
         result = np.empty((count, self.dimension), _NUMBER)
         rest = result.reshape(-1).view(np.uint8).data
         with self.lock:

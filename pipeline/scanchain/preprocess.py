@@ -1,4 +1,4 @@
-"""Preprocessing of a raw scan: cropped and downsampled, in voxels that follow the surroundings, and deskewed."""
+"""Preprocessing of a raw scan: cropped and downsampled, in voxels adapted to the surroundings, and deskewed."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from scanchain.range_noise import RangeNoise
 _LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
 _GROWTH = 4  # of a table that has no room for all voxels
 _RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
-_DENSE, _SPARSE = 60_000, 40_000  # returns of a scan from which on it is dense, and below which it no longer is
+_DENSE, _SPARSE = 60_000, 40_000  # returns at which a scan becomes dense, and below which it no longer is
 _FINE = math.sqrt(0.5)  # factor on the voxels of the map of dense scans, whose points fill finer ones
-_HYSTERESIS = 0.75  # powers of two between the present scale and the target scale, from which on it changes
+_HYSTERESIS = 0.75  # distance to the target scale, in powers of two, above which the scale changes
 _STEP = 2.0  # factor by which the voxels of matching shrink or grow from one scan to the next, at most
 _MAX_TRIES = 8  # number of times the first scan is downsampled, at most
 _AHEAD = 2  # scans that are prepared before they are asked for
@@ -35,10 +35,10 @@ _ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Points of a scan, one a voxel, with their times.
+    """Points of a scan, one per voxel, with their times.
 
     points : (M, d) float64 meters, each in the lidar frame of its own instant
-    times_s : (M,) seconds after the middle of the scan; (0,) where all count as measured at once
+    times_s : (M,) seconds after the middle of the scan; (0,) where all are taken as simultaneous
     middle_s : seconds from the scan's stamp to its middle
     """
 
@@ -63,12 +63,12 @@ class Sweep:
         return Sweep(self.points.take(chosen, axis=0), times_s, self.middle_s)
 
     def from_middle(self, velocity: NDArray[np.float64]) -> Points:
-        """The points (M, d) as seen from the lidar in the middle of the scan.
+        """The points (M, d) deskewed to the lidar's pose in the middle of the scan.
 
         velocity : (k,) twist per second in the lidar frame, constant through the scan
-        Why the middle: an error of the velocity then moves as many points forward as back and leaves the pose
-        alone. Seen from the first point it would shift the pose by half of itself, the next velocity by as much
-        in the other direction, and so on.
+        Why the middle: an error of the velocity then moves as many points forward as back, and the pose stays
+        right. Relative to the first point it would shift the pose by half of itself, the next velocity by as
+        much in the other direction, and so on.
         """
         if not self.is_distorted:
             return self.points
@@ -124,7 +124,7 @@ def first_per_voxel(
 
 
 class _Scratch(threading.local):
-    """Arrays of each thread, reused, as large as scans with so many voxels need: small ones stay in the cache."""
+    """Reused work arrays of each thread, no larger than its scans need: small ones stay in the CPU's cache."""
 
     def __init__(self) -> None:
         self.table, self.chosen = np.empty(_LEAST_SLOTS, np.int64), np.empty(_LEAST_SLOTS // 2, np.int32)
@@ -138,9 +138,9 @@ class Resolution:
 
     octave : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
         that the median range spans about _RANGE_VOXELS voxels of the local map, or more
-    scale : of the local map's voxels, times √½ for dense scans; their points stay as many
+    scale : of the local map's voxels: ``octave``, times √½ for dense scans, whose number of points stays the same
     match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain
-    noise : of the ranges, by the first scans
+    noise : of the ranges, measured on the first scans
     """
 
     def __init__(self, config: PreprocessConfig, voxel_size_m: float) -> None:
@@ -168,7 +168,7 @@ class Resolution:
         return self.downsampled(scan) if self.tries > 0 else (sweep, sparse)
 
     def _fit(self, points: Points, returns: int) -> bool:
-        """Adapt the sizes to the points to match, of so many returns; True if they fitted already."""
+        """Adapt the sizes to the points to match and the number of returns; True if they were right already."""
         before = self.scale, self.match_voxel_m
         median_range_m = float(np.median(np.linalg.norm(points, axis=1)))
         target = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
@@ -187,7 +187,7 @@ class Resolution:
 
 
 class Prepared(msgspec.Struct, frozen=True):
-    """A scan, downsampled for the map (``sweep``) and for matching (``sparse``), before anything moves it.
+    """A scan, downsampled for the map (``sweep``) and for matching (``sparse``), not yet deskewed.
 
     ``after`` holds the sizes for the next scan; ``seconds`` is the time that this one took.
     """
@@ -200,7 +200,7 @@ class Prepared(msgspec.Struct, frozen=True):
 
 
 def prepare(scan: Scan, resolution: Resolution) -> Prepared:
-    """A scan, downsampled at a resolution, which stays as it is."""
+    """A scan, downsampled at a resolution, which is not modified."""
     started, after = working_s(), copy(resolution)
     after.noise = after.noise.measured(scan.points)
     sweep, sparse = after.downsampled(scan)
@@ -208,7 +208,7 @@ def prepare(scan: Scan, resolution: Resolution) -> Prepared:
 
 
 def prepare_ahead(scans: Iterable[Scan], resolution: Resolution) -> Iterator[Prepared]:
-    """Scans prepared one after the other, in a thread of its own: none depends on a pose."""
+    """Scans prepared in order, in a separate thread: preparation does not depend on poses."""
 
     def following(scan: Scan) -> Prepared:
         nonlocal resolution

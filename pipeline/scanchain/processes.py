@@ -40,7 +40,7 @@ def peak_mib() -> float:
 
 
 def resident_mib(pid: int, seen: dict[int, psutil.Process] | None = None) -> float:
-    """Resident memory of a process and its children, which ``seen`` takes; 0 once it is gone."""
+    """Resident memory of a process and its children, which are added to ``seen``; 0 once it has ended."""
     total, seen = 0, {} if seen is None else seen
     for each in _family(pid):
         with suppress(psutil.Error):
@@ -50,7 +50,7 @@ def resident_mib(pid: int, seen: dict[int, psutil.Process] | None = None) -> flo
 
 
 def _family(pid: int) -> list[int]:
-    """A process and all below it; from Linux's lists of children, as looking through every process takes long."""
+    """A process and its descendants; by Linux's lists of children, as a search of all processes is slow."""
     if not Path(f"/proc/self/task/{os.getpid()}/children").exists():
         with suppress(psutil.Error):
             return [pid, *(child.pid for child in psutil.Process(pid).children(recursive=True))]
@@ -64,13 +64,13 @@ def _family(pid: int) -> list[int]:
 
 
 def return_freed_memory() -> None:
-    """Return memory that was freed to the system; glibc retains it between what is in use."""
+    """Return freed memory to the system; glibc keeps free blocks that lie between used ones."""
     with suppress(AttributeError, OSError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def available_mib() -> float:
-    """Memory that the machine can give without swapping."""
+    """Memory that is available without swapping."""
     return psutil.virtual_memory().available / _MIB
 
 
@@ -89,7 +89,7 @@ class Limits:
 
 
 class KilledFor(Enum):
-    """Reason why a process was killed, by what it is called then."""
+    """Reason why a process was killed; the value is the resulting status."""
 
     NOTHING = "crashed"
     TIME = "timed out"
@@ -101,8 +101,8 @@ class KilledFor(Enum):
 class Ending:
     """End of a process.
 
-    ``code`` is its exit code, negative for a signal; ``peak_mib`` the most that was seen of it in memory, its
-    children included.
+    ``code`` is its exit code, negative for a signal; ``peak_mib`` its largest observed memory, children
+    included.
     """
 
     code: int
@@ -132,9 +132,9 @@ class Ending:
 
 
 def die_with_parent(leftover: Path | None = None) -> None:
-    """Kill this process and its group once the one that started it by ``run_within`` is gone, however it ended.
+    """Kill this process and its group once its parent, which called ``run_within``, has ended for any reason.
 
-    leftover : folder that is removed before
+    leftover : folder to remove first
     """
     watched = os.dup(sys.stdin.fileno())  # a pipe that nobody writes to; the other end closes with the parent
     os.dup2(os.open(os.devnull, os.O_RDONLY), sys.stdin.fileno())
@@ -158,9 +158,9 @@ def run_within(
     interval_s: float,
     stop: Event | None = None,
 ) -> Ending:
-    """Run a module of Python to its end, or kill it when it takes too much or ``stop`` is set.
+    """Run a module of Python to its end, or kill it when it exceeds a limit or ``stop`` is set.
 
-    Its group of processes ends with it, and is no other's: a Ctrl-C on the terminal does not reach it. The module
+    It has a process group of its own, which ends with it: a Ctrl-C on the terminal does not reach it. The module
     calls ``die_with_parent``, or is run by this one, ``python -m scanchain.processes MODULE``, which does.
     interval_s : seconds between two readings of its memory
     """
@@ -173,7 +173,7 @@ def run_within(
             env=environment,
             start_new_session=True,
         )
-        seen: dict[int, psutil.Process] = {}  # all below it
+        seen: dict[int, psutil.Process] = {}  # all descendants
         began, peak, reason, stop = monotonic(), 0.0, KilledFor.NOTHING, stop or Event()
         try:
             while reason is KilledFor.NOTHING and process.poll() is None:
@@ -187,14 +187,14 @@ def run_within(
             return Ending(process.returncode or 0, reason, peak, monotonic() - began)
         finally:
             _kill(process.pid, with_group=True)
-            for each in seen.values():  # those in groups of their own that lost their parent, too
+            for each in seen.values():  # including orphans in groups of their own
                 with suppress(psutil.Error):
                     each.kill()
             process.communicate()
 
 
 def _kill(pid: int, *, with_group: bool) -> None:
-    """Kill a process, all below it, and the group that it leads, where members may be that lost their parent."""
+    """Kill a process, its descendants, and the group that it leads, which may contain orphans."""
     for each in reversed(_family(pid)[1:]):
         with suppress(OSError):
             os.kill(each, signal.SIGKILL)

@@ -15,22 +15,22 @@ _SCANS, _EVERY = 30, 3  # number of the first scans, of which every third is mea
 _PATCHES = 300  # of a scan, evenly spread
 _FREEDOM = 4  # points of a patch beyond the parameters of its plane
 _MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: median below _WITHIN, first quintile
-_WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # variances of a plane's residuals: most that counts as noise, share of those
-_PLANAR = 0.5  # least share of the patches at a range that are planar, of a range whose noise is known
-_FEWEST = 60  # patches at a range
-_CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is that of clutter
-_LEAST_M = 1e-4  # smallest standard deviation that is told: ranges may be rounded to one number
-_VARIES = 2.0  # ratio of the standard deviations at two ranges above which each is named
+_WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # a patch is planar up to this many noise variances; share below that
+_PLANAR = 0.5  # least share of planar patches at a range for its noise to be known
+_FEWEST = 60  # least number of patches at a range
+_CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is clutter
+_LEAST_M = 1e-4  # smallest standard deviation reported: ranges may be rounded to one number
+_VARIES = 2.0  # ratio of the standard deviations at two ranges above which the noise is reported by range
 _KNOWN = 0.3  # least share of the patches at ranges whose noise is known
 _NEAREST_M = 0.05
-_SECTORS, _SECTOR_POINTS = 16, 8000  # of the first cloud, if large, parts of 16 sectors are searched for neighbors
-_WEDGE_POINTS, _WEDGE_PATCHES = 2000, 75  # of those that follow a wedge about another azimuth each
-_GOLDEN = 0.618034  # of the cloud, from the point in the middle of one wedge to that of the next
+_SECTORS, _SECTOR_POINTS = 16, 8000  # a large first cloud: only parts of 16 sectors are searched for neighbors
+_WEDGE_POINTS, _WEDGE_PATCHES = 2000, 75  # later clouds: one wedge each, about another azimuth
+_GOLDEN = 0.618034  # share of the cloud's points between the middles of successive wedges
 
 
 @dataclass(frozen=True, eq=False)
 class RangeNoise:
-    """Noise of ranges by patches of neighboring beams, each against the plane through its points.
+    """Noise of ranges by patches of neighboring beams, as residuals to the plane fitted to each.
 
     A plane n·p = c seen along unit directions u has ranges with 1/r = (n/c)·u, which is linear in u: the residuals
     of least squares, times r², are those of ranges, whatever the incidence. Patches on edges and clutter have
@@ -49,7 +49,7 @@ class RangeNoise:
     sigma_m: float = 0.0
 
     def measured(self, points: RawPoints) -> RangeNoise:
-        """With another scan (N, d), as long as it is one of the first."""
+        """The noise updated by another scan (N, d), if it is one of the first."""
         if self.scans >= _SCANS:
             return self
         if self.scans % _EVERY:
@@ -69,7 +69,7 @@ class RangeNoise:
 
     @property
     def text(self) -> str:
-        """The standard deviation, by range where it is not the same at all."""
+        """The standard deviation as text, by range if it varies."""
         sigmas_m = [sigma_m for _, sigma_m, _ in self.by_range]
         if not self.sigma_m:
             return "unknown: too few surfaces whose beams lie next to each other"
@@ -103,14 +103,14 @@ def _typical_m(
 
 
 def _wedge(points: RawPoints, middle: int) -> RawPoints:
-    """Points of a cloud (N, 3) at azimuths about that of one, as many as there would be of one without gaps."""
+    """Points of a cloud (N, 3) in a wedge about the azimuth of one, sized for _WEDGE_POINTS without gaps."""
     x, y = points[:, 0], points[:, 1]
     across = np.abs(x[middle] * y - y[middle] * x)
     return points[across < math.tan(math.pi * _WEDGE_POINTS / len(points)) * (x[middle] * x + y[middle] * y)]
 
 
 def _patches(points: RawPoints, most: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Median range and variance of ranges (P,) of at most so many patches of a scan (N, d)."""
+    """Median range and variance of ranges (P,) of at most ``most`` patches of a scan (N, d)."""
     d = points.shape[1]
     size = d + _FREEDOM
     azimuth = np.arctan2(points[:, 1], points[:, 0])

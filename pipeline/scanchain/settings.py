@@ -18,7 +18,7 @@ from scanchain.config import Config
 from scanchain.config_keys import ConfigKey, Value, section_keys
 from scanchain.errors import InputError, one_line, shown
 
-_ALIKE = 0.75  # least likeness of a misspelt key to the one that is meant
+_ALIKE = 0.75  # least similarity of a misspelled key to the suggested one, by difflib
 _ORDERED = (
     ("log.start_s", "log.end_s"),
     ("log.min_range_m", "log.max_range_m"),
@@ -41,7 +41,7 @@ class Override:
 def overrides_of(values: Mapping[str, object], section: str = "") -> tuple[Override, ...]:
     """Keyword arguments as overrides, two underscores for the dot: ``loops__drift=0.02``.
 
-    section : that the keys are of, where the arguments do not name it
+    section : that of the keys, if the arguments do not name it
     """
     named = {f"{section}.{name}" if section else name.replace("__", "."): value for name, value in values.items()}
     return tuple(
@@ -74,7 +74,7 @@ def config_keys() -> dict[str, ConfigKey]:
 
 
 def find_key(name: str, source: str) -> ConfigKey:
-    """The key of that name; else the error names the nearest one there is."""
+    """The key of that name; else the error names the nearest existing one."""
     keys = config_keys()
     if name in keys:
         return keys[name]
@@ -90,7 +90,7 @@ def load_settings(
 ) -> Settings:
     """Defaults < the preset for logs of this dimension, if it is known < ``file`` < ``overrides``.
 
-    Raises InputError naming the file or the flag, the key and its limits, or the nearest key there is.
+    Raises InputError naming the file or the flag, the key and its limits, or the nearest existing key.
     """
     if dimension is not None and not (isinstance(dimension, int) and dimension in PRESETS):
         raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
@@ -181,13 +181,13 @@ def _check_dimension(values: Mapping[str, Value], dimension: int, source: str, r
 
 @functools.cache
 def _preset_values(dimension: int | None) -> Mapping[str, Value]:
-    """Every key as the preset of logs of this dimension sets it, of None the defaults."""
+    """Value of every key by the preset for logs of this dimension; for None the defaults."""
     layer = {} if dimension is None else read_layer(shipped("configs") / f"{PRESETS[dimension]}.toml")
     return {key: spec.default for key, spec in config_keys().items()} | layer
 
 
 def leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-    """Dotted names and values; what is no section, misspelt and empty ones included, comes under its own name."""
+    """Dotted names and values; entries outside sections, misspelled or empty ones too, as they are."""
     sections = {key.partition(".")[0] for key in config_keys()}
     for section, branch in tree.items():
         if isinstance(branch, Mapping) and (branch or section in sections):

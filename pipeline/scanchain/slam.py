@@ -1,4 +1,4 @@
-"""The whole chain: odometry, keyframes, loop closures, pose graph."""
+"""The whole pipeline: odometry, keyframes, loop closures, pose graph."""
 
 from __future__ import annotations
 
@@ -44,22 +44,22 @@ _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over o
 
 @dataclass(frozen=True, slots=True)
 class SlamResult:
-    """The result of a log.
+    """SLAM result of a log.
 
     ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
-    the scans that stand in the ``graph``; ``closures`` every loop closure tried. ``elevation_offset_rad`` is what
-    the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule;
+    the scans that are nodes of the ``graph``; ``closures`` every loop closure tried. ``elevation_offset_rad`` is
+    the correction of the lidar's vertical angles, from the scan ``calibrated_from`` on; usually 0;
     ``elevation_sigma_rad`` its standard deviation, infinite where none was estimated.
-    ``map_errors`` are those of the keyframes against the map.
-    ``warnings`` has a line on wheels that were left out; ``T_base_lidar`` (d+1, d+1) is the mounting as given, or
-    as estimated from the wheels, of which ``mounting_note`` tells.
-    ``map_log_odds`` are those that the log is where it was placed in a prior map, or, where they do not suffice,
-    might have been; NaN without a map, and if no keyframe was evidence for a location in it.
+    ``map_errors`` are those of the keyframes relative to the map.
+    ``warnings`` has a line on wheel odometry that was not used; ``T_base_lidar`` (d+1, d+1) is the mounting as
+    given, or as estimated from the wheels, which ``mounting_note`` describes.
+    ``map_log_odds`` are those of the log's location in a prior map, or of the best one if none was accepted; NaN
+    without a map, and if no keyframe was evidence for a location in it.
     ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
     suffice or there is none.
     ``map_alike_share`` is the share of the searches of the map that found several similar locations.
-    ``noise`` is that of the ranges, by the first scans.
-    ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
+    ``noise`` is that of the ranges, measured on the first scans.
+    ``components`` (K,) labels each keyframe's submap; no loop joins different submaps; usually there is one.
     """
 
     __repr__ = brief
@@ -110,10 +110,11 @@ class Slam:
         """Start before the first scan.
 
         config, T_base_lidar, dimension : as in ``Odometry``
-        points_file : where points go, which stay out of memory; without one, into a temporary file
-        is_live : whether no scan may wait: long searches go on over several, large graphs are optimized beside
+        points_file : file for the points, which are not kept in memory; a temporary one if omitted
+        is_live : whether no scan may wait: long searches are spread over several scans, large graphs optimized in
+            parallel
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
-        prior_is_final : whether they lie as well as they ever will; else scans are matched to one pass of them
+        prior_is_final : whether the poses of the map are final; else scans are matched to keyframes of one pass
         """
         config, T_start = checked_start(config, T_base_lidar, dimension)
         self.config, self.dimension = config, T_start.shape[0] - 1
@@ -134,7 +135,7 @@ class Slam:
         return f"{type(self).__name__}({scans}, {counted(len(self.keyframes), 'keyframe')}, {tried} tried)"
 
     def _begin_in(self, prior: SavedMap, is_final: bool) -> None:
-        """Take the keyframes of a map, fixed where they are; the log begins somewhere, perhaps in it."""
+        """Add the keyframes of a map as fixed nodes; where the log starts, perhaps in the map, is unknown."""
         if prior.dimension != self.dimension:
             raise InputError(
                 f"{prior.folder}: is a {prior.dimension}D map, the log has {self.dimension}D scans; give a map of "
@@ -179,16 +180,16 @@ class Slam:
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:
-        """Place a scan as a driver gives it, arguments as in ``Odometry.track``, and whatever it closes.
+        """Process a scan as a driver gives it, arguments as in ``Odometry.track``: locate it and close loops.
 
-        From the first on, a large graph is optimized beside: no scan waits for it.
+        From the first call on, a large graph is optimized in parallel: no scan waits for it.
         """
         self.is_live = True
         scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
         return self.live_stamps.passed(scan, self.process)
 
     def process(self, scan: Scan | Prepared) -> Step:
-        """Place one scan, and whatever it closes. Raises InputError after ``finish``."""
+        """Locate one scan and close loops. Raises InputError after ``finish``."""
         self._check_unfinished()
         located = self.front_end.locate(scan)
         mine = owned(located.tracked)
@@ -196,7 +197,7 @@ class Slam:
         return replace(step, points=mine.matched, T_odom_lidar=mine.T_odom_lidar, match=mine.match)
 
     def place(self, located: Located) -> Step:
-        """Place one scan that ``front_end`` located; nobody may write into the arrays of the step."""
+        """Add one scan that ``front_end`` located, and close loops; the arrays of the step are read-only."""
         self._check_unfinished()
         tracked = located.tracked
         started = working_s()
@@ -224,10 +225,10 @@ class Slam:
         )
 
     def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
-        """Close what is left, optimize once more, spread the corrections over all scans and refine these.
+        """Close the remaining loops, optimize once more, correct all scans accordingly and refine their poses.
 
         progress : called with the name of each stage when it begins
-        Raises InputError without a scan, and when called again.
+        Raises InputError if no scan was processed, and when called again.
         """
         self._check_unfinished()
         trail, first = self.trail, self.trail.first
@@ -276,7 +277,7 @@ class Slam:
             raise InputError("Slam.finish was called: its result is whole; begin another Slam for further scans")
 
     def _add(self, located: Located) -> bool:
-        """Add a scan; whether it is a keyframe, which is then joined to the last one in the graph."""
+        """Add a scan; True if it is a keyframe, which is then joined to the last one in the graph."""
         if not self.trail.add(located):
             return False
         newest, config, tracked = self.keyframes[-1], self.config.odometry, located.tracked

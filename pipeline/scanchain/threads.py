@@ -9,7 +9,7 @@ MOST = 256
 
 
 def use_threads(count: int) -> None:
-    """Use so many threads from now on."""
+    """Use ``count`` threads from now on."""
     os.environ[VARIABLE] = str(count)
 
 

@@ -17,7 +17,7 @@ from scanchain.point_store import PointStore
 
 
 class Trail:
-    """Pose by odometry of every scan; keyframes, those of a prior map first, with their points.
+    """Odometry pose of every scan; keyframes, those of a prior map first, with their points.
 
     ``first`` is the first keyframe of the log, ``lost_before`` the number of scans lost before the newest one.
     """
@@ -35,14 +35,14 @@ class Trail:
         self.traveled_m = 0.0
 
     def begin_in(self, keyframes: Sequence[Keyframe], traveled_m: float) -> None:
-        """Put the keyframes of a map first, which are known without errors; the path goes on from so many m."""
+        """Put the keyframes of a map first, without errors; the path length continues from ``traveled_m``."""
         k = lie.twist_size(keyframes[0].T_odom_lidar)
         self.keyframes += keyframes
         self.map_errors += [KeyframeErrors(1.0, np.zeros((k, k)), 1.0) for _ in keyframes]
         self.first, self.traveled_m = len(keyframes), traveled_m
 
     def add(self, located: Located) -> bool:
-        """Add a scan; whether it moved far enough to be a keyframe, which is then the newest."""
+        """Add a scan; True if it moved far enough to be a keyframe, which is then the newest."""
         tracked = located.tracked
         if len(self.odometry_poses):
             self.traveled_m += lie.apart(self.odometry_poses.rows[-1], tracked.T_odom_lidar)[0]
@@ -76,7 +76,7 @@ class Trail:
 
     @property
     def odometry(self) -> Trajectory:
-        """Every scan as odometry has it."""
+        """Odometry poses of all scans."""
         return Trajectory(self.stamps_ns.rows.copy(), self.odometry_poses.rows.copy())
 
     @property

@@ -23,7 +23,7 @@ _ORTHONORMAL = 1e-3  # largest deviation of RᵀR from identity in a KITTI file,
 
 
 def read_tum(path: Path | str) -> Trajectory:
-    """SE(3) poses of a TUM file, ``stamp x y z qx qy qz qw`` a line, or of a run directory, in order.
+    """SE(3) poses of a TUM file, ``stamp x y z qx qy qz qw`` per line, or of a run directory, in order.
 
     Stamps are taken from their decimal text, so that nanoseconds stay exact; they need not increase.
     """
@@ -41,7 +41,7 @@ def read_tum(path: Path | str) -> Trajectory:
 def write_tum(path: Path | str, trajectory: Trajectory, *, force: bool = False) -> None:
     """Write a TUM file, nine digits after the point; SE(2) poses lie in the plane z = 0.
 
-    force : whether a file that is there is replaced; else InputError
+    force : whether an existing file is replaced; else InputError
     Raises InputError where there is no such folder, and OSError where the disk is full.
     """
     path = checks.path(path, "path")
@@ -58,10 +58,10 @@ def _tum_rows(trajectory: Trajectory) -> Iterator[str]:
 
 
 def write_wide_tum(path: Path, trajectory: Trajectory, covariances: Matrix) -> None:
-    """Write a TUM file with the covariance (N, k, k) of each pose behind it, 29 numbers a line.
+    """Write a TUM file with the covariance (N, k, k) after each pose, 29 numbers per line.
 
     Of a twist in the pose's own frame, T exp(ξ), (translation, rotation): the lower triangle of (6, 6), by rows.
-    In the plane, what lies outside of it is known to a micrometer. Raises OSError where the disk is full.
+    Of planar poses, z, roll and pitch have standard deviations of 1e-6 m or rad. OSError if the disk is full.
     """
     lifted = covariances
     if trajectory.dimension == 2:
@@ -74,15 +74,15 @@ def write_wide_tum(path: Path, trajectory: Trajectory, covariances: Matrix) -> N
 
 
 def read_kitti(path: Path | str) -> Trajectory:
-    """SE(3) poses of a KITTI file, the upper 3 × 4 of a matrix a line, row by row.
+    """SE(3) poses of a KITTI file, the upper 3 × 4 of one matrix per line, row by row.
 
-    The format has no time: the stamp of a pose is its line's number, from 0, so that two files pair line by line.
+    The format has no time: the stamp of a pose is its line's number, from 0, so that two files pair by line.
     """
     places, _, values = table(path, "KITTI line", _KITTI_FIELDS)
     rows = values.reshape(-1, 3, 4)
     error = np.abs(np.swapaxes(rows[:, :, :3], 1, 2) @ rows[:, :, :3] - np.eye(3)).max(axis=(1, 2))
     for bad in np.flatnonzero((error > _ORTHONORMAL) | (np.linalg.det(rows[:, :, :3]) < 0.0))[:1]:
-        raise InputError(f"{places[bad]} is no rotation: RᵀR is not the identity within {_ORTHONORMAL:g}")
+        raise InputError(f"{places[bad]} is not a rotation: RᵀR is not the identity within {_ORTHONORMAL:g}")
     U, _, Vt = np.linalg.svd(rows[:, :, :3])
     return Trajectory(np.arange(len(rows), dtype=np.int64), posed(U @ Vt, rows[:, :, 3]))
 
@@ -133,7 +133,7 @@ def table(
         times_ns.append([parse_stamp_ns(word, place) for word in words[:stamps]])
         rows.append(numbers(words[stamps:], place))
     if not rows:
-        raise InputError(f"{path} has no {kind}; expected one a line: {fields}")
+        raise InputError(f"{path} has no {kind}; expected one per line: {fields}")
     return places, np.array(times_ns, np.int64), np.array(rows)
 
 
@@ -146,7 +146,7 @@ def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(f"{path} is not text; expected a trajectory with one pose a line") from None
+        raise InputError(f"{path} is not text; expected a trajectory with one pose per line") from None
     except OSError as error:
         reason = remedy_of(error) or f"{path} cannot be read ({error.strerror}); check the path"
         raise InputError(reason) from None

@@ -106,7 +106,7 @@ def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
         axes.plot(
             [r[2] for r in chosen], [1e3 * r[3] for r in chosen], style, color=color, marker=".", label=label
         )
-    axes.set(xscale="log", yscale="log", xlabel="points a scan", ylabel="ms a scan")
+    axes.set(xscale="log", yscale="log", xlabel="points per scan", ylabel="ms per scan")
     figure.legend(title="method, threads", fontsize="small", loc="outside right center")
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=120)

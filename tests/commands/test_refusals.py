@@ -10,7 +10,7 @@ from tests.support.naive_logs import STAMP_NS, laser_scan, scan_said, write
 
 RUN = ["run", "{office}", "--out", "{tmp}/a"]
 RING = ["optimize", "{ring}"]
-TOO_LONG = ["longer than the file system takes (255 bytes a part); shorten it"]
+TOO_LONG = ["longer than the file system takes (255 bytes per part); shorten it"]
 
 
 def test_several_lidars_ask_for_a_choice_by_the_short_option_which_info_and_convert_take_too(
@@ -72,7 +72,7 @@ def test_several_lidars_ask_for_a_choice_by_the_short_option_which_info_and_conv
             [*RING, "--marginals", "9", "--out", "a.g2o"],
             ["--marginals 9: no such vertex; the ids go from 0 to 3"],
         ),
-        ([*RING, "--marginals", "one", "--out", "a.g2o"], ["take all, or vertex ids"]),
+        ([*RING, "--marginals", "one", "--out", "a.g2o"], ["give all, or vertex ids"]),
         ([*RING, "--png", "a.jpg"], ["name a file that ends in .png"]),
         ([*RING, "--recording", "a.png"], ["name a file that ends in .rrd"]),
         ([*RING, "--out", "zz.txt"], ["zz.txt: name a file that ends in .g2o or .graph or .toro"]),

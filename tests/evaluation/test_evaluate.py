@@ -331,7 +331,7 @@ def test_a_kitti_file_gives_the_k_th_scan_its_k_th_row_and_must_have_as_many(tmp
     stopped = file.first(12).at(truth.stamps_ns[:12])
     np.testing.assert_array_equal(stopped.stamps_ns, truth.stamps_ns[:12])
     for refused in (lambda: file.check(truth.stamps_ns, 29), lambda: file.at(truth.stamps_ns[:12])):
-        with pytest.raises(InputError, match="one line a scan"):
+        with pytest.raises(InputError, match="one line per scan"):
             refused()
 
 

@@ -96,9 +96,9 @@ def test_a_live_log_waits_for_no_long_optimization_of_a_large_graph(monkeypatch)
     monkeypatch.setattr(schedule, "_LARGE", 200)
     laps = Laps()
     laps.grow(300, is_live=True)
-    assert laps.schedule.beside is not None and laps.schedule.beside.due > 300
-    laps.grow(laps.schedule.beside.due, is_live=True)
-    assert laps.optimized[-1] == (len(laps.graph), 0) and laps.schedule.beside is None
+    assert laps.schedule.background is not None and laps.schedule.background.due > 300
+    laps.grow(laps.schedule.background.due, is_live=True)
+    assert laps.optimized[-1] == (len(laps.graph), 0) and laps.schedule.background is None
 
 
 def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_added_since():

@@ -152,7 +152,7 @@ def test_an_exact_drive_is_found_and_what_is_not_its_own_is_counted(folder):
 @pytest.mark.parametrize(
     ("file", "text", "said"),
     [
-        ("Robot1_Odometry.dat", "1.0 2.0\n", "has no 3 numbers a line"),
+        ("Robot1_Odometry.dat", "1.0 2.0\n", "does not have 3 numbers per line"),
         ("Robot1_Odometry.dat", "1.0 2.0 x\n", "is no table of 3 numbers"),
         ("Robot1_Odometry.dat", "# time forward turn\n \n", "is empty"),
         ("Robot1_Odometry.dat", None, "one of those logged there: none"),

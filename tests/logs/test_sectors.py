@@ -87,7 +87,7 @@ def test_points_without_times_of_their_message_are_timed_by_their_place_in_the_r
     expected, log, scans = sweeps(tmp_path, how, of)
     assert_same(scans, expected, within_s=3e-3)
     if of is SPATIAL:
-        says(log.assumed_point_times(), "by the azimuth: clockwise, 0.1 s a turn")
+        says(log.assumed_point_times(), "by the azimuth: clockwise, 0.1 s per turn")
         assert log.assumed_point_times() in log.notes
 
 

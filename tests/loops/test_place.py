@@ -312,7 +312,7 @@ def test_of_two_places_that_are_the_same_none_is_said_to_be_it(tmp_path):
     ]
     closures, _ = sought([*there, *again], passage(street(4.0, True)[4:7]), tmp_path)
     reasons = {closure.reason for closure in sum(closures, ())}
-    assert reasons == {"another place of the map is as similar"}
+    assert reasons == {"another location in the map is as similar"}
     assert UprightMap([*there, *again], configured(3)).is_repeated(there[1:11])
     assert not UprightMap(there, configured(3)).is_repeated(there[1:11])
 

@@ -108,7 +108,7 @@ def test_a_mounting_that_nothing_shows_is_called_assumed(tmp_path, capfd):
 def test_a_drive_straight_on_leaves_the_place_open(tmp_path):
     path = simulated("ahead", mounted(90, 0.3), tmp_path, world="corridor", seconds=12.0)
     _, text = run(path, tmp_path, loops__enabled=False)
-    says(text, "lidar turned by ", "its place is not observable: the log hardly turns")
+    says(text, "lidar turned by ", "its position is not observable: the log hardly turns")
 
 
 def test_an_interrupted_estimate_goes_on_to_the_bit(tmp_path):

@@ -83,7 +83,7 @@ def test_a_whole_log_of_another_place_is_never_placed_though_it_returns_to_its_s
     code, said, error = call("localize", office / "office.mcap", "--map", tmp_path / "other", "--out", out)
     assert (code, error) == (1, "")
     assert said.startswith(f"verdict        not trustworthy\n{REASON}not from this place: nothing in ")
-    assert said.splitlines()[1].endswith(" is in other")
+    assert said.splitlines()[1].endswith(" matches other")
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["placed"] == metrics["matches"] == 0
     assert metrics["states"]["searching"] == metrics["scans"] and not (out / "trajectory.tum").exists()
@@ -97,7 +97,7 @@ def test_a_log_that_fits_several_places_of_its_map_alike_is_not_said_to_be_of_an
     found = localize(log, prior, tmp_path / "loc", recording=False)
     assert found.metrics.placed == 0
     assert found.metrics.reason.startswith("not certain: 60 scans over ")
-    assert "fit several places of hall" in found.metrics.reason
+    assert "fit several locations in hall" in found.metrics.reason
 
 
 def test_a_localized_log_names_the_directory_that_it_was_written_to_and_its_map(
@@ -169,7 +169,7 @@ def test_the_verdict_names_what_speaks_for_the_place(office, monkeypatch):
         rival, saved, config
     )
     alike = measure(found, saved, config, 1.0, ())
-    assert alike.verdict == Verdict.CHECK and "2 of 6 paths in it look like other places, too" in alike.reason
+    assert alike.verdict == Verdict.CHECK and "2 of 6 paths in it also fit other locations" in alike.reason
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_the_verdict_names_what_speaks_for_the_place(office, monkeypatch):
             ["--out", "OUT", "--initial", "1,2"],
             "--initial is '1,2'; give x,y,yaw in meters and degrees, or a file .tum",
         ),
-        (["--out", "OUT", "--loops.enabled=false"], "a place in a map is found by loop closures; leave it true"),
+        (["--out", "OUT", "--loops.enabled=false"], "localization in a map needs loop closures; leave it true"),
         (["--out", "MAP", "--force"], "is one of the maps; choose another --out"),
         (["--out", "MAP/map", "--force"], "is one of the maps; choose another --out"),
     ],

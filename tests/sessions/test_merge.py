@@ -292,7 +292,7 @@ def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(re
     closures = tuple(Closure(i, j, match, 0.95, ClosureVerdict.ACCEPTED, "") for i, j in pairs.tolist())
     joined = Joined((0, 1), keyframes, np.repeat([0, 1], count), edges, closures)
     doubt = doubt_about(joined, count, config)
-    assert ("look like other places" in doubt) == bool(doubt) == repeats
+    assert ("also fit other locations" in doubt) == bool(doubt) == repeats
     few = replace(joined, edges=edges.where(pairs[:, 0] < 3))
     assert "short path" in doubt_about(few, count, config)
 

@@ -404,7 +404,7 @@ def test_a_town_log_reads_back(tmp_path):
         ({"noise_m": float("nan")}, "noise_m nan"),
         ({"seed": -1}, "seed -1"),
         ({"start_m": -1.0}, "start_m -1 is out of range"),
-        ({"world": "turns", "reverse": True}, "turns is no route"),
+        ({"world": "turns", "reverse": True}, "turns has no closed route"),
         ({"wheels_slip": Slip(3.0, 2.0, 1.0)}, "wheels_slip from 3 to 2 s"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Colors as numbers and as text, and what they stand for in pages, pictures and recordings."""
+"""Colors, what they stand for in reports, figures and recordings, and palettes."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scanchain.data import BACK_END, VERIFICATION
 from scanchain.verdict import Kind
 
-# Those of a run are apart from each other on white and on black, also for readers who confuse red and green.
+# Distinguishable from each other on white and on black, also with red-green color blindness.
 STRETCH_COLORS = {
     Kind.DEGENERATE: "#dc9a00",
     Kind.LOST: "#b3150c",
@@ -22,7 +22,7 @@ STRETCH_COLORS = {
     Kind.DISCONNECTED: "#6b7280",
     Kind.COPIES: "#4d7c0f",
 }
-CLOSURES = {  # by whom a closure was rejected, "" where it was accepted: what it is called and its line's color
+CLOSURES = {  # what rejected a closure, "" if it was accepted: its name in legends and its line's color
     VERIFICATION: ("rejected by verification", "#f0958d"),
     BACK_END: ("rejected by the back end", "#eb463c"),
     "": ("accepted", "#3f9b2f"),
@@ -48,13 +48,13 @@ def rgb(color: str) -> tuple[int, int, int]:
 
 
 def height_shares(z: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(N,) places of heights between the 2nd percentile, 0, and the 98th, 1."""
+    """(N,) heights scaled and clipped to 0 at their 2nd percentile and 1 at their 98th."""
     low, high = np.percentile(z, (2.0, 98.0))
     return np.clip((z - low) / max(float(high - low), 1e-9), 0.0, 1.0)
 
 
 def between(anchors: Sequence[tuple[int, int, int]], shares: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """(N, 3) colors at shares (N,) of the way through colors that are equally far from each other."""
+    """(N, 3) colors interpolated between evenly spaced anchors, at fractions (N,) from 0 to 1."""
     places = shares * (len(anchors) - 1.0)
     channels = np.array(anchors, np.float64).T
     mixed = np.stack([np.interp(places, np.arange(len(anchors)), channel) for channel in channels], axis=1)
@@ -62,6 +62,6 @@ def between(anchors: Sequence[tuple[int, int, int]], shares: NDArray[np.floating
 
 
 def palette_of(colors: Sequence[str], count: int = 256) -> NDArray[np.uint8]:
-    """(K, 4) opaque colors between some that are equally far from each other, #rrggbb."""
+    """(K, 4) opaque colors interpolated between evenly spaced anchors, #rrggbb."""
     mixed = between([rgb(color) for color in colors], np.linspace(0.0, 1.0, count))
     return np.pad(mixed, ((0, 0), (0, 1)), constant_values=255)

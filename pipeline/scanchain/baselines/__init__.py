@@ -1,4 +1,4 @@
-"""Odometries by others behind one protocol, by name.
+"""Third-party odometry methods behind one protocol, by name.
 
 A new one is a class in ``wrapped``, as ``Baseline`` describes it, and a line in ``BASELINES``. Outside the
 package, ``scanchain compare --methods my_module:MyClass`` runs a class of yours, given its table of --config as

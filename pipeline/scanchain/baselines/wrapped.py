@@ -1,4 +1,4 @@
-"""Odometries by others: KISS-ICP, GenZ-ICP, small_gicp, and Open3D's ICP from scan to scan; their protocol."""
+"""Third-party odometries: KISS-ICP, GenZ-ICP, small_gicp, and Open3D's ICP from scan to scan; their protocol."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from scanchain.errors import MissingExtraError
 
 
 class Baseline(Protocol):
-    """An odometry by others, run on the same scans as ours.
+    """A third-party odometry method, run on the same scans as ours.
 
     Any class with ``track`` can be compared; without a ``description`` it goes by its name.
     """
@@ -40,7 +40,7 @@ class Baseline(Protocol):
 
 
 def finite(points: RawPoints, times_s: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points without NaN and inf as float64, and the times of those that stay.
+    """Points without NaN and inf as float64, and their times.
 
     Times that are all equal are dropped: KISS-ICP divides by their span.
     """
@@ -87,14 +87,14 @@ class AtStamp:
         return self.T_odom_theirs @ T_theirs_held @ lie.exp(-held_s * velocity)
 
 
-_LEVELS, _STEP_M = 5, 0.1  # of a scan that is given height
+_LEVELS, _STEP_M = 5, 0.1  # copies of a planar scan at different heights, and their spacing
 
 
 class InPlane:
     """Feeds a 3D baseline with planar scans and brings its poses back into the plane.
 
-    Points lie at z = 0 or, where the method looks for surfaces, stand on top of each other: walls, whose normals
-    are horizontal. All levels are alike, so that the height is unobservable.
+    Points lie at z = 0 or, where the method looks for surfaces, are copied at several heights: walls, whose
+    normals are horizontal. All levels are identical, so that the height is unobservable.
     """
 
     def __init__(self, baseline: Baseline, *, is_raised: bool) -> None:
@@ -112,7 +112,7 @@ class InPlane:
         return lie.flatten(self.baseline.track(raised, np.tile(times_s, levels), stamp_ns))
 
 
-_DISTORTED = 2  # it deskews by the motion before, and has none for its first two scans
+_DISTORTED = 2  # first scans that it does not deskew, for lack of a previous motion
 
 
 def _imported(module: str, package: str) -> Any:
@@ -169,7 +169,7 @@ class KissIcp:
 
 Preset = Literal["outdoor", "indoor", "kitti"]
 
-# What its outdoor.yaml, indoor.yaml and kitti.yaml say beside its defaults.
+# Settings of its outdoor.yaml, indoor.yaml and kitti.yaml that differ from its defaults.
 _DATA = {"outdoor": {"min_range": 0.5}, "indoor": {"min_range": 0.3}, "kitti": {"min_range": 5.0}}
 _OUTDOOR = {"voxel_size": 0.6, "desired_num_voxelized_points": 3000, "max_points_per_voxel": 3}
 _MAPPING = {"outdoor": _OUTDOOR, "indoor": {}, "kitti": _OUTDOOR | {"planarity_threshold": 0.18}}
@@ -259,7 +259,7 @@ class _Chained:
         return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
 
     def _prepared(self, points: NDArray[np.float64]) -> Any:
-        """What a scan is registered by."""
+        """The preprocessed cloud that is registered."""
         raise NotImplementedError
 
     def _registered(self, cloud: Any) -> Pose:
@@ -309,7 +309,7 @@ class SmallGicpPairs(_SmallGicp):
 
 
 class SmallGicpModel(_SmallGicp):
-    """Scan to a map of Gaussian voxels (VGICP), into which the last scan is put first."""
+    """Scan to a map of Gaussian voxels (VGICP), into which the previous scan is inserted first."""
 
     def __init__(self, settings: VgicpSettings = VGICP) -> None:
         super().__init__(settings)

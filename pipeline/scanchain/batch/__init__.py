@@ -1,1 +1,1 @@
-"""Many logs, each in a process of its own."""
+"""Batches of logs, each run in its own process."""

@@ -1,4 +1,4 @@
-"""A batch: every log without a result is run in a process of its own; all of them become batch.parquet."""
+"""A batch: every log without a result is run in its own process; the results of all become batch.parquet."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
 from scanchain.verdict import Verdict
 
-_NODE_LOSSES = 10  # of a task, before it counts as lost
-_SHARE = 0.75  # of the memory that is free, for all workers together
+_NODE_LOSSES = 10  # largest number of retries of a task after its cluster node died
+_SHARE = 0.75  # share of the free memory for all workers together
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
     "scans", "dimension", "ok", "contradicted", "degenerate", "lost", "keyframes", "closures_tried",
@@ -47,12 +47,12 @@ Work = Callable[[Sequence[Task]], Iterator[Row]]
 class Batch:
     """Logs to run, with configuration and limits.
 
-    logs : a file, folder or address each
+    logs : files, folders or addresses
     out : the batch's directory, created or resumed
-    config_file, overrides : for every log; arguments : the same and more, for ``scanchain run``
+    config_file, overrides : for every log; arguments : these and others, for ``scanchain run``
     workers : processes at a time on this machine
-    time_s : limit of a log; memory_mib : likewise, None for a fair share of the free memory
-    retries : further tries of a log that crashed its process
+    time_s : time limit per log; memory_mib : memory limit per log, None for an equal share of the free memory
+    retries : further tries of a log whose process crashed
     """
 
     logs: tuple[Source, ...]
@@ -68,7 +68,7 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Batched:
-    """A finished batch; ``kept`` of the rows are those of earlier calls."""
+    """A finished batch; ``kept`` is the number of rows from earlier calls."""
 
     rows: tuple[Row, ...]
     kept: int
@@ -76,11 +76,11 @@ class Batched:
 
     @property
     def failures(self) -> str:
-        """Number of logs without a result or with one not to be trusted, as text; empty if there are none."""
+        """Number of logs without a result or with an untrustworthy one, as text; empty if there are none."""
         absent = sum(not row.state.has_result for row in self.rows)
-        doubted = sum(row.state is State.NOT_TRUSTWORTHY for row in self.rows)
+        untrusted = sum(row.state is State.NOT_TRUSTWORTHY for row in self.rows)
         parts = [f"{absent:,} of {len(self.rows):,} logs have no result"] if absent else []
-        parts += [f"{doubted:,} of {len(self.rows):,} logs are not trustworthy"] if doubted else []
+        parts += [f"{untrusted:,} of {len(self.rows):,} logs are not trustworthy"] if untrusted else []
         return ", ".join(parts)
 
     @property
@@ -94,11 +94,11 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
     """Run the logs without a result and write the table.
 
     work : where the tasks are run; None for processes on this machine
-    On Ctrl-C what runs is killed, and the table lists what was not run. Raises InputError for a directory that
-    cannot be made or is another's, and a configuration that is wrong.
+    On Ctrl-C running logs are killed, and the table lists those not run. Raises InputError for a directory that
+    cannot be created or holds something else, and for an invalid configuration.
     """
     _check_out(batch)
-    key_of("", batch.config_file, batch.overrides)  # what is wrong with it is wrong for every log
+    key_of("", batch.config_file, batch.overrides)  # an invalid configuration is invalid for every log
     try:
         (batch.out / ROWS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -125,7 +125,7 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
 
 
 def _check_out(batch: Batch) -> None:
-    """Refuse a directory that holds something else than a batch, or lies in a run or in a log that is a folder."""
+    """Raise InputError for a directory that holds anything but a batch, or lies in a run or in a log folder."""
     if complaint := misspelled(batch.out):
         raise InputError(complaint)
     check_outside_runs(batch.out)
@@ -161,7 +161,7 @@ def _not_run(task: Task) -> Row:
 
 
 def _local(workers: int, tasks: Sequence[Task]) -> Iterator[Row]:
-    """Run tasks by processes on this machine, so many at a time."""
+    """Rows of tasks that are run by processes on this machine, ``workers`` at a time."""
     stop = Event()
     with ThreadPoolExecutor(workers, "batch") as pool:
         futures = [pool.submit(attempt, task, stop) for task in tasks]
@@ -173,9 +173,9 @@ def _local(workers: int, tasks: Sequence[Task]) -> Iterator[Row]:
 
 
 def on_cluster(address: str) -> Work:
-    """Cores of a Ray cluster that sees the same files, a log each; those of a machine that dies move to another.
+    """Runner of tasks on a Ray cluster with access to the same files, one core per log; retries if a node dies.
 
-    address : of the cluster's head, or "auto" for the one that this machine belongs to
+    address : of the cluster's head node, or "auto" for the cluster that this machine belongs to
     Raises MissingExtraError without Ray, InputError where no cluster responds.
     """
     try:
@@ -204,7 +204,7 @@ def on_cluster(address: str) -> Work:
 
 
 def write_table(folder: Path, rows: Sequence[Row]) -> str:
-    """Write table and summary, each whole or not at all; the summary's text."""
+    """Write table and summary, each completely or not at all; the text of the summary."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -217,7 +217,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
     )
     notes = {
         "warnings": "warnings in the run's metrics.json: data lost, skipped or wrong",
-        "run": "directory of the result, beside this file; empty where there is none",
+        "run": "directory of the result, next to this file; empty where there is none",
         "duration_s, peak_mib": "of the whole process of the last try",
         "ate_*, kitti_*": "against the ground truth in the log, after optimization; null without any",
     }
@@ -279,7 +279,7 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
 
 
 def _cells(row: Row) -> dict[str, object]:
-    """Cells by column, and more; what a log without result or ground truth lacks becomes null."""
+    """Cells by column, and more; those missing for a log without result or ground truth become null."""
     cells = msgspec.to_builtins(row)
     metrics = cells["metrics"] or {}
     truth = metrics.get("ground_truth") or {"optimized": {}, "odometry": {}}
@@ -290,8 +290,8 @@ def _cells(row: Row) -> dict[str, object]:
 def collect(named: Sequence[Source], manifests: Sequence[Path], log_format: str = AUTO) -> tuple[Source, ...]:
     """Every log once, in the order named; patterns and folders are replaced by the logs in them, by name.
 
-    log_format : a folder is looked into only where the format is not given
-    manifests : text files with a path, address or pattern a line, paths relative to the file; # begins a comment
+    log_format : a folder is searched for logs only if the format is not given
+    manifests : text files with one path, address or pattern per line, relative to the file; # begins a comment
     Raises InputError for a pattern that matches nothing and a manifest that cannot be read.
     """
     paths = list(_matched(named, "the command line"))
@@ -320,7 +320,7 @@ def _listed(manifest: Path) -> list[Source]:
 
 
 def _matched(named: Iterable[Source], where: str) -> Iterator[Source]:
-    """Sources with patterns replaced; a path that exists is taken as it is, whatever its letters."""
+    """Sources with patterns replaced; an existing path is used as it is, whatever characters it contains."""
     for source in named:
         if isinstance(source, Path):
             is_pattern = bool(set("*?[") & set(str(source))) and not source.exists()

@@ -46,12 +46,12 @@ class State(StrEnum):
 class Task(Struct, frozen=True):
     """A log to run, with arguments and limits.
 
-    log : the file, folder or address; identity : of its path, size and last change, empty where it cannot be read
-    key : of its identity and all that decides about the result
+    log : file, folder or address; identity : hash of its path, size and time of change, empty if unreadable
+    key : hash of its identity and of everything that determines the result
     out : the batch's directory
     arguments : for ``scanchain run``
-    limits : of its process
-    retries : further tries of one that crashed
+    limits : limits of its process
+    retries : further tries after a crash
     """
 
     log: str
@@ -69,12 +69,12 @@ class Task(Struct, frozen=True):
 
     @property
     def run(self) -> Path:
-        """The run directory; its name is that of the log and the key's first letters."""
+        """The run directory, named after the log and the first characters of the key."""
         return Path(self.out) / f"{source_of(self.log).resolve().stem}-{self.key[:8]}"
 
     @property
     def row_file(self) -> Path:
-        """File of its row, beside the run directory."""
+        """File of its row, in the batch's folder of rows."""
         return Path(self.out) / ROWS_FOLDER / f"{self.key}.json"
 
 
@@ -99,7 +99,7 @@ class Row(Struct, frozen=True):
 
     @property
     def why(self) -> str:
-        """The reason without the name of the log, behind which it stands."""
+        """The reason without the name of the log at its beginning."""
         return self.reason.removeprefix(f"{self.log}: ")
 
 
@@ -109,7 +109,7 @@ def output_file(out: Path, key: str) -> Path:
 
 
 def finished_row(task: Task) -> Row | None:
-    """The row of a task that an earlier call has done, if its run directory is still there."""
+    """The row of a task that an earlier call completed, if its run directory still exists."""
     try:
         row = msgspec.json.decode(task.row_file.read_bytes(), type=Row)
     except (OSError, msgspec.DecodeError):
@@ -130,7 +130,7 @@ _THREADS = (VARIABLE, *(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPEN
 
 
 def attempt(task: Task, stop: Event | None = None) -> Row:
-    """Run a log, again where it crashed and has tries left; raises nothing."""
+    """Row of a log, run again after a crash while tries are left; raises nothing."""
     row = _tried(task, stop)
     while row.state is State.CRASHED and row.tries <= task.retries:
         row = msgspec.structs.replace(_tried(task, stop), tries=row.tries + 1)
@@ -144,7 +144,7 @@ def _tried(task: Task, stop: Event | None) -> Row:
         task.limits,
         "scanchain.processes",
         ["scanchain", "run", "--out", str(task.run), "--force", *task.arguments, "--", task.log],
-        os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
+        os.environ | dict.fromkeys(_THREADS, "1"),  # one process per core: more threads would only compete
         output=output,
         interval_s=_LOOK_S,
         stop=stop,
@@ -165,13 +165,13 @@ def _result(task: Task) -> tuple[str, Metrics]:
 
 
 def _own_ending(ending: Ending, task: Task, output: list[str]) -> tuple[State, str] | None:
-    """End state and reason by exit code, output and result; None of a process that crashed, or left no result."""
+    """End state and reason by exit code, output and result; None for a process that crashed or left no result."""
     error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     with suppress(OSError, msgspec.DecodeError):
         metrics = _result(task)[1]
         if ending.code == 0:
             return State.DONE, ""
-        is_new = f"written        {task.run}" in output  # else these metrics are of a run before
+        is_new = f"written        {task.run}" in output  # else these metrics are of an earlier run
         if ending.code == 1 and is_new and metrics.verdict is Verdict.NOT_TRUSTWORTHY:
             return State.NOT_TRUSTWORTHY, metrics.verdict_reason
     if ending.code in (1, 2) and error:

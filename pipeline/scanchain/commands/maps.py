@@ -134,7 +134,7 @@ def merge(runs: tuple[Path, ...], out: Path, fixed: bool, update: bool, as_json:
 
     RUN is a run directory, or that of an earlier merge; where each began need not be known. Loops are closed
     between the runs, and the graph of all of them is optimized and certified. The map is in the frame of the first
-    RUN; the order of the others does not matter. Runs that too few closures join to the others, or look-alike
+    RUN; the order of the others does not matter. Runs that too few closures join to the others, or ambiguous
     places only, are named and stay apart; where no two belong together, the exit code is 1. DIR is a map like any
     other: it can be merged further. With --update it follows its newest session: what is gone is removed from the
     keyframes of older ones.

@@ -41,12 +41,12 @@ class Comparison:
 
     logs : the files of one log
     out : the directory to make
-    methods : names; none are all that make sense; matcher : one of the configuration's, compared as well
-    config_file : sections of the configuration and a table a method; overrides : keys of the configuration, for
-        the log and all of ours
-    ground_truth : a TUM or KITTI file; None where the log's own is good
+    methods : names, empty for all that apply; matcher : another one, as in the configuration
+    config_file : sections of the configuration and one table per method; overrides : keys of the configuration,
+        for the log and all of ours
+    ground_truth : a TUM or KITTI file; None for the log's own
     relations : a file of relations
-    repeat : runs of every method, in turn
+    repeat : runs of every method, interleaved
     time_s, memory_mib : limits of a run; None for the default ones
     force : whether a directory of that name is replaced
     command : the command line, for the report
@@ -82,7 +82,7 @@ class Compared:
 
 
 def compare(comparison: Comparison, present: Callable[[Path], None], progress: Progress) -> Compared:
-    """Run the comparison and write its directory; ``present`` adds report and recording to what lies there.
+    """Run the comparison and write its directory; ``present`` adds report and recording to it.
 
     Raises InputError for bad input before anything is run.
     """

@@ -21,7 +21,7 @@ _ANY = "matcher"  # ours with the matcher that the settings name
 OURS = (*MATCHERS, *(f"{name}+loops" for name in MATCHERS), _ANY, f"{_ANY}+loops")
 _ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti")
 _BASE = "method"  # the key of a table that names the method it is a variant of
-_KINDS = ("matching.matcher", "loops.enabled")  # keys that tell ours apart
+_KINDS = ("matching.matcher", "loops.enabled")  # keys that distinguish our methods
 _SECTIONS = Config.__struct_fields__
 _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configuration that no single method has
 
@@ -32,7 +32,7 @@ class Method(Struct, frozen=True):
     name : what the tables call it
     base : one of OURS or BASELINES, or MODULE:CLASS with a Baseline's methods (in 2D of points (N, 2) and poses
         (3, 3)), which is given the settings as keywords
-    settings : as TOML holds them; for ours the configuration but for what all methods share, by section
+    settings : as TOML holds them; for ours the configuration by section, except those that all methods share
     """
 
     name: str
@@ -65,7 +65,7 @@ def resolve(
     file : TOML, one table a method; a table of another name is a variant of the one that its key ``method`` names
     overrides : keys of the configuration, for all of ours; sections of it in ``file`` are ``shared_settings``
     matcher : one that is compared as well; ours with MODULE:CLASS are called CLASS and CLASS+loops
-    Raises InputError for a name or a key that there is not.
+    Raises InputError for an unknown name or key.
     """
     tables = {name: table for name, table in _tables(file).items() if name not in _SECTIONS}
     names = [each for name in names for each in ([name] if name in tables else _spelled_out(name, dimension))]
@@ -95,7 +95,7 @@ def resolve(
 
 
 def shared_settings(file: Path | None) -> tuple[Override, ...]:
-    """The keys that the sections of a file set for the log and all of ours, but for those that tell them apart."""
+    """The keys that the sections of a file set for the log and all of ours, except those in _KINDS."""
     sections = {name: table for name, table in _tables(file).items() if name in _SECTIONS}
     return tuple(each for each in _overrides(sections, f"{file}:") if each.key not in _KINDS)
 

@@ -46,7 +46,7 @@ class Ours:
         return trajectory
 
     def measure_errors(self, scans: StoredScans, folder: Path) -> None:
-        """Write the expected ATE, by all scans once more, into the folder."""
+        """Write the expected ATE, by processing all scans once more, into the folder."""
         again = scans.scans() if self.config.outputs.error_bars == "full" else None
         expected = expected_of(self.result, self.config, again, scans.distorted_share)
         (folder / METRICS_FILE).write_bytes(msgspec.json.encode({"expected_ate_m": expected and expected.ate}))

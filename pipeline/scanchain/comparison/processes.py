@@ -1,7 +1,7 @@
 """Methods over the same stored scans, run by run, each in a process of its own with limits on time and memory.
 
-Scan by scan they are read into memory of their own rather than mapped: what is mapped counts as resident, and the
-memory of a method would grow with the log. Straight after decoding the files lie in the system's page cache.
+Scans are read one by one rather than memory-mapped: mapped pages count as resident, and the measured memory of a
+method would grow with the log. Right after decoding, the files are in the system's page cache.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _INTERVAL_S = 0.02  # between two readings of a process's memory
 
 @dataclass(frozen=True, slots=True)
 class StoredScans:
-    """Scans in a file, one behind the other, and what is known of all of them.
+    """Scans in a file, one after the other, and the data common to them.
 
     points : (N,) numbers of points of each scan
     stamps_ns, log_times_ns : (N,) as in ``Scan``
@@ -79,7 +79,7 @@ def encode(value: object) -> bytes:
 
 
 def decode(data: bytes, kind: type[T]) -> T:
-    """The records again."""
+    """The records that ``encode`` was given."""
 
     def array(_: type, stored: Any) -> NDArray[Any]:
         dtype, shape, content = stored
@@ -147,9 +147,9 @@ class Outcome:
     """A run of a method.
 
     report : how it ended
-    odometry : (N, d+1, d+1) pose of each scan straight after it came; NaN from where it failed on
+    odometry : (N, d+1, d+1) pose of each scan right after it was processed; NaN from the failure on
     trajectory : final poses, equal to ``odometry`` except with loop closures; empty if it did not finish
-    seconds, cpu_seconds : (N,) tracking a scan, on the clock and spent by all threads; NaN like the poses
+    seconds, cpu_seconds : (N,) wall-clock and CPU time (all threads) per scan; NaN like the poses
     folder : where its tables lie
     """
 
@@ -195,7 +195,7 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
     """A run in a process of its own; its folder takes what it writes and prints."""
     folder.mkdir()
     (folder / TASK_FILE).write_bytes(encode((method, scans)))
-    # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time
+    # small_gicp's threads spin by default: on shared cores that delays other threads
     environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
     output, own = folder / "output.txt", folder / REPORT_FILE
     ending = run_within(
@@ -210,7 +210,7 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
 
 
 def _outcome(folder: Path, report: EndReport, scans: StoredScans) -> Outcome:
-    """Outcome of a run from its folder, complete or not; a failure's reason begins with the scan that it met."""
+    """Outcome of a run from its folder, complete or not; a failure's reason names the scan it occurred at."""
     track, where = np.full(len(scans), np.nan, scans.track_type), "while starting or warming up"
     if (folder / TRACK_FILE).exists():
         track = np.load(folder / TRACK_FILE)

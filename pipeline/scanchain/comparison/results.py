@@ -41,9 +41,9 @@ _INTERVALS = ((1.0, "s"), (10.0, "m"), (100.0, "m"))  # of the RPE
 _NOTES = {
     "x y z qx qy qz qw": "final T_world_lidar of the method",
     "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
-    "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
+    "seconds, cpu_seconds": "wall-clock and CPU time (all threads) of tracking the scan",
     "distance_m": "traveled up to the scan, by the method itself",
-    "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
+    "error_m, error_rad": "relative to the paired true pose, after alignment; null where there is none",
     "nees": "of the motion up to the scan; null where the method reports no covariance",
 }
 
@@ -64,7 +64,7 @@ class Assessed:
 
     T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
         end; the identity without truth
-    by_scan : (N,) ``error_m``, ``error_rad`` and ``nees``, NaN where a scan has no true pose beside it
+    by_scan : (N,) ``error_m``, ``error_rad`` and ``nees``, NaN where a scan has no paired true pose
     relations : the error over relations; None without any, or after a failure
     definitions : of the figures, as text
     """
@@ -143,7 +143,7 @@ def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
 
 
 def _speed(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
-    """From all runs that came to their end; the first scan of each stands apart."""
+    """Times over all finished runs; the first scan of each is reported separately."""
     whole = [outcome for outcome in outcomes if outcome.is_whole]
     if not whole:
         peak = max(outcome.report.peak_mib for outcome in outcomes)
@@ -165,7 +165,7 @@ def _speed(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
 
 
 def _stages(outcome: Outcome) -> dict[str, float]:
-    """Seconds by stage of a method that reports them; the mean for loops, most scans of which take nothing."""
+    """Seconds by stage of a method that reports them; the mean for loops, on which most scans spend no time."""
     table = _steps(outcome, "preprocess_s", "match_s", "map_s", "loops_s")
     if table is None or len(table) < 2:
         return {}
@@ -202,7 +202,7 @@ def results_of(
 
 
 def write_results(folder: Path, results: Results) -> None:
-    """Everything scan by scan, and a folder a method with trajectory, map, tables, and what it printed."""
+    """Write the per-scan tables, and a folder per method with trajectory, map, tables, and its output."""
     _write_tables(folder / SCANS_FILE, _scans(results), _NOTES)
     _write_tables(folder / RELATIONS_FILE, _relations(results.assessed))
     if results.reference.truth is not None:
@@ -248,7 +248,7 @@ def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
 
 
 def _scans(results: Results) -> list[pa.Table]:
-    """The scans of all runs, each with its own errors, those that failed up to where they came."""
+    """The scans of all runs, each run with its own errors; failed runs up to the failure."""
     tables = []
     for name, outcomes in results.outcomes.items():
         for repeat, outcome in enumerate(outcomes):

@@ -31,7 +31,7 @@ class Column(Struct, frozen=True):
     """Presentation of a figure.
 
     key : of the figure
-    head, unit : what stands above it
+    head, unit : its heading
     scale : from the figure's unit to the shown one
     digits : after the point, at most
     better : which values are marked as the best; none of a figure that is not about accuracy or cost, as the NEES
@@ -141,7 +141,7 @@ class Row(Struct, frozen=True):
     settings : whole, as a TOML file for --config would hold them
     definitions : of its errors, as text
     verdict, verdict_reason : on its trajectory, of other tools by wheels and constant velocity; empty if it failed
-    verdict_error : the error that the verdict vouches for
+    verdict_error : the error bound that the verdict states
     """
 
     name: str
@@ -180,7 +180,7 @@ class Table(Struct, frozen=True):
     truth : reference of the errors; empty without ground truth
     truth_note : how many scans have no true pose, or why a truth could not be used; else empty
     disagreement_m : row by row the median distance between two methods' motions; None where one has failed
-    notes : what was chosen or assumed, a line each
+    notes : what was chosen or assumed, one per line
     baselines : versions of the packages that were compared
     """
 

@@ -1,7 +1,7 @@
 """``python -m scanchain.comparison.worker FOLDER``: one method over all scans, in this process alone.
 
-FOLDER holds the task; poses and times are written into it scan by scan: those until a crash are there. It lies in
-the directory of the comparison, which is removed where its process is killed.
+FOLDER holds the task; poses and times are written into it scan by scan: those before a crash are kept. It lies in
+the directory of the comparison, which is removed if its process is killed.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
-    """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
+    """Import and compile with a throwaway instance; errors are ignored here, as they will occur again."""
     if method.base in BASELINES and not BASELINES[method.base].forgets:
         return
     runner = start(method, T_base_lidar)

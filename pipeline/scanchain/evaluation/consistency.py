@@ -20,7 +20,7 @@ from scanchain.errors import InputError
 from scanchain.graph.factors import turns
 from scanchain.graph.pose_graph import PoseGraph
 
-_BATCHES, _BATCH = 50, 10  # of samples, which together would fill the memory
+_BATCHES, _BATCH = 50, 10  # number and size of batches of samples: all at once would fill the memory
 _BOUNDS = (2.5, 97.5)  # percentiles of the error bar
 _RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions leave a rotation free
 _DRIFT_OF_NOISE = 2.0  # drift of a map over its renewal, in standard deviations of independent errors of the scans
@@ -28,7 +28,7 @@ _DRIFT_OF_SYSTEMATIC = 5.0  # the same of errors that successive scans have in c
 _REVISIT = 2.0  # variances of the systematic error in a loop edge: of both passes
 _OVERESTIMATE = 2.0  # variance of the jackknife over the true one: see ``_scales``
 _MOST_MEDIANS = 3.0  # influence of a group of directions over the median, above which the log needs the group
-_MOST_OPEN = 0.5  # largest standard deviation of the instant of a pose in a distorted scan, of its duration
+_MOST_OPEN = 0.5  # largest standard deviation of the instant of a pose in a distorted scan, over its duration
 _LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
 
 RADIUS_M = {2: 0.2, 3: 0.5}
@@ -42,7 +42,7 @@ _MIN_COVERAGE = 0.5  # least share of the query points of the best map that anot
 class ExpectedError(Struct, frozen=True):
     """Mean of an error, and its error bar; meters.
 
-    is_random : of random errors only
+    is_random : True if systematic errors are not included
     where : the part of the log whose positions are the most uncertain, in words; empty for none
     """
 
@@ -60,7 +60,7 @@ class ExpectedError(Struct, frozen=True):
 
 
 class ScanPoses(NamedTuple):
-    """Poses of scans that hang on those of keyframes.
+    """Poses of scans, each attached to that of a keyframe.
 
     poses : (N, d+1, d+1); keyframe : (N,) number of the keyframe of each
     of_keyframes : (K,) numbers of the scans that are keyframes
@@ -76,13 +76,13 @@ class ScanPoses(NamedTuple):
 
     @classmethod
     def of(cls, poses: Matrix, of_keyframes: NDArray[np.int64], open_motions: Matrix) -> ScanPoses:
-        """Each scan hangs on the last keyframe up to it."""
+        """Each scan is attached to the last keyframe up to it."""
         keyframe = np.searchsorted(of_keyframes, np.arange(len(poses)), side="right") - 1
         positions = poses[:, :-1, -1]
         return cls(poses, keyframe, of_keyframes, positions - positions[of_keyframes][keyframe], open_motions)
 
     def errors(self, of_keyframes: Matrix) -> Matrix:
-        """(n, N, k) errors of the scans as of their keyframes (n, K, k), along the world's axes."""
+        """(n, N, k) errors of the scans caused by those of their keyframes (n, K, k), along the world's axes."""
         d = self.arms_m.shape[1]
         errors = of_keyframes[:, self.keyframe]
         errors[..., :d] += (turns(self.arms_m) @ errors[..., d:, None])[..., 0]
@@ -99,7 +99,7 @@ class ExpectedErrors(NamedTuple):
 def expected_ate(graph: PoseGraph) -> ExpectedError:
     """ATE (rmse after rigid alignment) of the poses of a graph, if the covariances of its edges are right.
 
-    The distribution is that of samples of the position errors δ. To first order the alignment takes from them what
+    The distribution is that of samples of the position errors δ. To first order the alignment removes what
     one twist of all positions explains:
         ATE² = min over ξ of 1/N Σ ‖δᵢ − ρ − φ × tᵢ‖²
     Raises InputError where the edges leave poses free.
@@ -135,9 +135,9 @@ def error_samples(
 ) -> Iterator[Matrix]:  # fmt: skip
     """Samples of the errors of ``expected_errors``, some (n, N, k) of all scans at a time, after rigid alignment.
 
-    Of position and orientation, along the world's axes. The pose of a scan errs as its keyframe; by itself; as
-    the groups of directions say; and where scans may be distorted, as the instant of a scan that its pose is the
-    right one of, which changes with what the lidar sees.
+    Of position and orientation, along the world's axes. The error of a scan's pose is the sum of that of its
+    keyframe; an independent one; those by groups of directions; and where scans may be distorted, one by the
+    instant at which its pose holds, which changes with what the lidar sees.
     """
     if not len(graph.edges):
         raise InputError("the pose graph has no edge, so that no error is expected; give more keyframes")
@@ -169,15 +169,15 @@ def with_map_errors(
     graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, *,
     systematic_drift: float = _DRIFT_OF_SYSTEMATIC,
 ) -> tuple[PoseGraph, Matrix]:  # fmt: skip
-    """The graph with covariances of edges for judging it, and covariances (K, k, k) of each pose by itself.
+    """The graph with covariances of edges for expected errors, and independent covariances (K, k, k) of poses.
 
-    Poses that are aligned to one map err by themselves against it, and together as it drifts. With N the
-    covariance of a keyframe by its residuals, S that by which sectors of its scans disagree, and u the share of
+    Poses aligned to one map have independent errors relative to it, and common ones as it drifts. With N the
+    covariance of a keyframe by its residuals, S that by the disagreement of sectors of its scans, u the share of
     the map that is new since the keyframe before, the motion between two keyframes drifts by the covariance
         (2u)² N + (5u)² S.
-    A scan aligned to the mean of the m before walks by 2/(m + 1) of its error: hence 2u. S adds up from scan to
-    scan, by a factor that was measured. Every pose also errs by N + S; loop edges, of two passes, have N + 2 S.
-    The covariances of the graph have floors instead, which serve the optimizer.
+    A scan aligned to the mean of the m before drifts by 2/(m + 1) of its error: hence 2u. S accumulates from scan
+    to scan, by a measured factor. Every pose also has the independent error N + S; loop edges, of two passes, have
+    N + 2 S. The covariances of the graph have floors instead, which serve the optimizer.
     map_errors, config : of the run
     systematic_drift : the 5; 0 where systematic drift is measured instead
     """
@@ -200,7 +200,7 @@ def edge_errors(
     information: Matrix, is_loop: NDArray[np.bool_], map_errors: Sequence[KeyframeErrors], config: Config,
     systematic_drift: float = _DRIFT_OF_SYSTEMATIC,
 ) -> tuple[Matrix, Matrix]:  # fmt: skip
-    """Covariances (E, k, k) of edges, and of the later pose of each by itself, by ``with_map_errors``.
+    """Covariances (E, k, k) of edges, and the independent one of the later pose of each, by ``with_map_errors``.
 
     information : (E, k, k) of the edges in the graph; map_errors : of the later keyframe of each
     """
@@ -335,9 +335,10 @@ def sharpness(maps: Sequence[Points]) -> list[Sharpness | None]:
     smallest eigenvalue λ₁, and over the query points q
         mean map entropy       1/Q Σ_q ½ ln det(2πe Σ(q))     in nats for Σ in m²
         surface thickness      √(1/Q Σ_q λ₁(q))               in meters, the root of the mean variance across it
-    A query point counts if in every map it has 10 neighbors at least and a covariance that is not flat by accident
-    (λ₁ > 0). Lower is sharper. Moving objects blur all maps alike. It is not ground truth: a map that is bent but
-    sharp scores well. None for a fragmented map: it would leave too few points to compare the others at.
+    A query point counts if in every map it has 10 neighbors at least and a covariance that is not flat by
+    accident (λ₁ > 0). Lower is sharper. Moving objects blur all maps equally. It is not ground truth: a map that
+    is distorted but sharp scores well. None for a fragmented map: it would leave too few points to compare the
+    others at.
     """
     eigenvalues = np.array([_eigenvalues(points) for points in maps])
     good: NDArray[np.bool_] = np.all(np.isfinite(eigenvalues) & (eigenvalues > 0.0), axis=2)
@@ -354,7 +355,7 @@ def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Poi
 
     The lidar is where the trajectory has it at the instant of a point, between two stamps along the screw that
     joins their poses.
-    scans : one a pose of the trajectory
+    scans : one per pose of the trajectory
     """
     after = velocities(trajectory)
     before = np.vstack([after[:1], after[:-1]])
@@ -363,7 +364,7 @@ def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Poi
 
 
 def velocities(trajectory: Trajectory) -> NDArray[np.float64]:
-    """(N, k) twist per second from each pose to the next, of the last one as before; 0 where stamps stand."""
+    """(N, k) twist per second from each pose to the next, the last one repeated; 0 if stamps do not increase."""
     seconds = 1e-9 * np.diff(trajectory.stamps_ns)[:, None]
     twists = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
     result = np.zeros((len(trajectory), twists.shape[1]))
@@ -373,7 +374,7 @@ def velocities(trajectory: Trajectory) -> NDArray[np.float64]:
 
 
 def sampling_step(points: int) -> int:
-    """Of all points of a log every so many-th is taken."""
+    """Step at which the points of a log are sampled."""
     return max(1, points // MAX_POINTS)
 
 

@@ -28,12 +28,12 @@ _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count a
 _FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # ATE above both of which odometry failed: share of the path, meters
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
 _LARGEST = 2.0  # largest length of a segment over the requested one
-_LONG_PATH_M = 200.0  # length of the path from which on the published lengths leave a choice of starts
+_LONG_PATH_M = 200.0  # shortest path on which the published lengths allow several starts
 _FIELDS = "stamp1 stamp2 x y z roll pitch yaw"
 
 
 class Alignment(StrEnum):
-    """Alignment of the estimate to the reference before comparison. None changes the scale."""
+    """Alignment of the estimate to the reference before comparison. No alignment changes the scale."""
 
     NONE = "none"
     FIRST = "first"
@@ -50,7 +50,7 @@ class Alignment(StrEnum):
 
 
 def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
-    """T_reference_estimate (4, 4), to be put in front of each estimated pose.
+    """T_reference_estimate (4, 4), by which each estimated pose is multiplied from the left.
 
     estimate, reference : (N, 4, 4) paired poses. Planar ones are aligned within the plane, where a mirrored
     trajectory cannot be aligned by turning the plane over. Raises InputError where a rotation is unobservable.
@@ -117,7 +117,7 @@ class Statistics:
 
     @property
     def degrees(self) -> Statistics:
-        """Those of radians in degrees, for print."""
+        """The figures of errors in radians converted to degrees, for printing."""
         return Statistics(self.count, *(float(np.degrees(value)) for value in astuple(self)[1:]))
 
 
@@ -153,7 +153,7 @@ class Metric:
 class AbsoluteError(Metric):
     """ATE over paired poses (Sturm et al. 2012, eq. 3; Zhang & Scaramuzza 2018).
 
-    alignment : how the frames were brought together
+    alignment : how the frames were aligned
     translation_m : of ‖t_ref − t_est‖
     rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
     path_length_m : of the reference, over the paired poses
@@ -188,7 +188,7 @@ def far_off(ate_rmse_m: float, share: float | None, path_length_m: float) -> str
     return (
         f"far from the ground truth: ATE {ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
         f"{path_length_m:.1f} m; above {100.0 * _FAR_OFF_SHARE:g} % a trajectory is wrong somewhere, or the truth "
-        "is in another unit, keeps another clock or follows another body"
+        "is in another unit, uses another clock or follows another body"
     )
 
 
@@ -250,7 +250,7 @@ class RelativeError(Metric):
 
     size : of the segments, in words
     translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
-    stretches : (M, 2) int64 places i, j among the pairs
+    stretches : (M, 2) int64 indices i, j of the first and last pair of each segment
     """
 
     size: str
@@ -286,7 +286,7 @@ def relative_error_over_time(pairs: Pairs, duration_s: float) -> RelativeError:
 
 
 def _relative_error(pairs: Pairs, along: Floats | NDArray[np.int64], size: float, words: str) -> RelativeError:
-    """RPE from each pair to the first that lies at least a size further; to none that a gap makes too far.
+    """RPE from each pair to the first that lies at least a size further, unless a gap makes it over twice as far.
 
     along : (N,) frames, meters or nanoseconds up to each pair
     """
@@ -344,7 +344,7 @@ class KittiError:
     definition : of the figures, as text; pairing : over which poses
     translation_share : ‖t‖ / length; times 100 it is the published per cent
     rotation_rad_per_m : angle / length
-    stretches : how many there were
+    stretches : number of segments
     by_length : the same, length by length
     """
 
@@ -475,7 +475,7 @@ class RelationError(Metric):
 
 
 def read_relations(path: Path | str) -> Relations:
-    """Relations of a text file, ``stamp1 stamp2 x y z roll pitch yaw`` a line, angles in radians."""
+    """Relations of a text file, ``stamp1 stamp2 x y z roll pitch yaw`` per line, angles in radians."""
     _, stamps_ns, values = table(path, "relation", _FIELDS, stamps=2)
     R = Rotation.from_euler("xyz", values[:, 3:]).as_matrix()
     return Relations(stamps_ns, posed(R, values[:, :3]))

@@ -1,4 +1,4 @@
-"""Every metric of a trajectory against the truth at once, after its time offset and scale."""
+"""All metrics of a trajectory against the truth, after correction of its time offset and scale."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from scanchain.evaluation.errors import (
 from scanchain.evaluation.pairing import Pairs, pair, read_truth
 from scanchain.trajectory import read_tum
 
-_FARTHEST_S, _STEP_S = 1.0, 0.05  # offsets that are tried: the largest, and from one to the next
+_FARTHEST_S, _STEP_S = 1.0, 0.05  # largest offset tried, and step between offsets
 _EXACT_S = 1e-5  # error of the offset at which the search ends
 _FLAT = 1.02  # ratio of the ATE at the farthest offsets to the least, below which it does not depend on the offset
 
 
 def shifted(trajectory: Trajectory, offset_s: float) -> Trajectory:
-    """The trajectory with so many seconds added to its stamps."""
+    """The trajectory with ``offset_s`` added to its stamps."""
     return Trajectory(trajectory.stamps_ns + round(offset_s * 1e9), trajectory.poses)
 
 
@@ -103,10 +103,10 @@ _INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
 class Results:
     """Metrics by name: those computed, and the reason for each that could not be.
 
-    ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, a line each
+    ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, one per line
     ``start_m`` : error of the motion from the first pose to the second; ``after_start`` : the ATE without that
     ``scale``, ``time_offset_s`` : the factor put on the estimate and the seconds added to its stamps before that
-    ``aligned`` : (N, 4, 4) the estimate as the ATE compares it, ``reference`` the true poses beside it
+    ``aligned`` : (N, 4, 4) the estimate as the ATE compares it, ``reference`` the true poses paired with it
     """
 
     found: dict[str, Result]
@@ -162,9 +162,9 @@ def evaluate(
     """Every metric that a trajectory and its ground truth allow: ATE, RPE over each interval, KITTI.
 
     estimate : a trajectory, a TUM file, or a run directory, for its trajectory.tum
-    truth : a trajectory, a TUM file, or a KITTI file with one row a pose of the estimate
+    truth : a trajectory, a TUM file, or a KITTI file with one row per pose of the estimate
     align : "rigid", "first" or "none", for the ATE
-    max_gap_s : truth is interpolated over at most this; by default five of its usual intervals, 0.1 to 0.6 s
+    max_gap_s : widest gap of the truth to interpolate over; by default five typical intervals, 0.1 to 0.6 s
     rpe : intervals in poses, seconds or meters
     scale : whether the estimate is scaled to fit the truth first (Umeyama 1991), for one of unknown scale
     time_offset : seconds to add to the stamps of the estimate, or "auto" for those of the least ATE within ±1 s

@@ -31,11 +31,11 @@ class Pairs:
 
     stamps_ns : (N,) int64, the estimate's
     estimate, reference : (N, 4, 4) poses; SE(2) lifted into the plane z = 0
-    places : (N,) int64, of the poses among those of the estimate
-    estimate_count, reference_count : poses there were
+    places : (N,) int64, indices of the poses in the estimate
+    estimate_count, reference_count : numbers of poses before pairing
     interpolated : how many of the N reference poses lie between two of the reference's own
-    early, late, in_gap : estimated poses without a reference pose: before its begin, after its end, in gaps of it
-    gap_s : between true poses that may be interpolated over; widest_s : between those that were
+    early, late, in_gap : estimated poses without a reference pose: before its start, after its end, in gaps of it
+    gap_s : widest gap of the reference to interpolate over; widest_s : widest interpolated over
     """
 
     __repr__ = brief
@@ -67,7 +67,7 @@ class Pairs:
 
     @property
     def after_start(self) -> Pairs:
-        """Those from the second pose of the estimate on: the motion up to it is predicted by nothing."""
+        """The pairs from the second pose of the estimate on: nothing predicts the motion up to it."""
         if not self.starts:
             return self
         parts = {name: getattr(self, name)[1:] for name in ("stamps_ns", "estimate", "reference", "places")}
@@ -110,7 +110,7 @@ class Pairs:
 
     @property
     def warnings(self) -> list[str]:
-        """Reasons for which figures over these pairs may mislead, a line each."""
+        """Reasons for which figures over these pairs may mislead, one per line."""
         lines = []
         if 2 * len(self) < self.estimate_count:
             lines.append(
@@ -132,7 +132,7 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     reference, and where its neighbors are more than ``gap_s`` apart, an estimated pose has none, except one within
     the rounding of a stamp written in milliseconds. Neither trajectory's stamps need increase.
 
-    gap_s : None for five usual intervals of the reference, from 0.1 to 0.6 s; half of its time lies in longer ones
+    gap_s : None for five typical intervals of the reference (half of its time lies in longer ones), 0.1 to 0.6 s
     """
     for name, trajectory in (("estimate", estimate), ("reference", reference)):
         if not len(trajectory):
@@ -208,9 +208,9 @@ def span(stamps_ns: NDArray[np.int64]) -> str:
 
 
 def _usual_interval_ns(ordered_ns: NDArray[np.int64]) -> float:
-    """The interval of stamps in which an instant lies at the median; 0 where all are equal.
+    """Time-weighted median of the intervals between stamps; 0 where all are equal.
 
-    Of stamps that come in bursts most intervals are next to nothing, and so is their median.
+    If stamps come in bursts, most intervals are close to zero, and so is their plain median.
     """
     intervals = np.sort(np.diff(ordered_ns))
     if not intervals.any():
@@ -220,7 +220,7 @@ def _usual_interval_ns(ordered_ns: NDArray[np.int64]) -> float:
 
 
 def _interpolated(T_a: Matrix, T_b: Matrix, share: NDArray[np.float64]) -> Matrix:
-    """Poses (K, d+1, d+1) so far from a to b: position linear, rotation by SLERP."""
+    """Poses (K, d+1, d+1) at a share of the motion from a to b: position linear, rotation by SLERP."""
     d = T_a.shape[-1] - 1
     R_a, R_b = T_a.copy(), T_b.copy()
     R_a[:, :d, d] = R_b[:, :d, d] = 0.0
@@ -231,11 +231,11 @@ def _interpolated(T_a: Matrix, T_b: Matrix, share: NDArray[np.float64]) -> Matri
 
 def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
     here, there = estimate.stamps_ns, reference.stamps_ns
-    spans = f"the estimate ({span(here)}) has no pose with a true one beside it in the reference ({span(there)})"
+    spans = f"the estimate ({span(here)}) has no pose that can be paired with the reference ({span(there)})"
     if len(np.unique(there)) == 1:
         return f"{spans}, which has poses at one instant alone; give true poses all along the trajectory"
     if here.max() < there.min() or there.max() < here.min():
-        return f"{spans}; check that both keep the same clock"
+        return f"{spans}; check that both use the same clock"
     return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; --max-gap allows more"
 
 
@@ -251,7 +251,7 @@ class TruthFile:
     has_stamps: bool
 
     def check(self, scans_ns: NDArray[np.int64], scans: int) -> None:
-        """Refuse a file that cannot belong to so many scans between these stamps. Raises InputError."""
+        """Refuse a file that cannot belong to this number of scans between these stamps. Raises InputError."""
         if self.has_stamps:
             check_overlap(str(self.path), self.poses.stamps_ns, scans_ns)
         else:
@@ -265,7 +265,7 @@ class TruthFile:
         return Trajectory(stamps_ns, self.poses.poses)
 
     def first(self, scans: int) -> TruthFile:
-        """Of a KITTI file that of the first scans alone; a TUM file as it is."""
+        """The poses of the first scans only, of a KITTI file; a TUM file as it is."""
         if self.has_stamps:
             return self
         poses = Trajectory(self.poses.stamps_ns[:scans], self.poses.poses[:scans])
@@ -275,7 +275,7 @@ class TruthFile:
         if len(self.poses) != scans:
             raise InputError(
                 f"{self.path}: has {counted(len(self.poses), 'line')} for {counted(scans, 'scan')}; "
-                "a KITTI file has one line a scan that is read, or give a TUM file, which has stamps"
+                "a KITTI file has one line per scan that is read, or give a TUM file, which has stamps"
             )
 
 
@@ -284,7 +284,7 @@ def check_overlap(source: str, truth_ns: NDArray[np.int64], scans_ns: NDArray[np
     if truth_ns.min() > scans_ns.max() + _SLACK_NS or truth_ns.max() < scans_ns.min() - _SLACK_NS:
         raise InputError(
             f"{source}: its poses ({span(truth_ns)}) and the scans ({span(scans_ns)}) have no time in common; "
-            "check that both keep the same clock and that it belongs to this log"
+            "check that both use the same clock and that it belongs to this log"
         )
 
 

@@ -17,28 +17,28 @@ from scanchain.graph.edge_checks import is_connected
 from scanchain.graph.factors import turns
 from scanchain.graph.problem import GraphProblem
 
-_ZERO_CHI2 = 1e-9  # of the largest information, or of 1 if that is less: below it χ² is zero but for rounding
+_ZERO_CHI2 = 1e-9  # share of the largest information, or of 1 if that is less, up to which χ² is rounding noise
 _EXACT = 1e-12  # share of χ² that rounding alone may amount to
 _GIVEN_UP = (0.0, 1e-6, 1e-4, 1e-2)  # shares of χ² by which the bound is lowered, tried one after the other
 _SLOPE = 0.9311  # largest norm of V(φ)⁻¹ for rotations up to π: (π²/16 + 1/4)^½
 _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, as a factor of θ*², up to 1 rad
 _FARTHEST = 1.0  # largest θ*, rad, of an edge that is bounded
 _ROUNDING = 1e-9  # share by which the isotropic information stays below the smallest eigenvalue
-_TINY = 1e-30  # in place of no information at all, so that nothing is divided by zero
-_PAID_FROM_TAU = 2.0  # factor on the part of the cost that is paid from τ: the more, the more of κ is left
+_TINY = 1e-30  # replaces zero information, to avoid a division by zero
+_PAID_FROM_TAU = 2.0  # factor on the part of the cost that is taken from τ: a larger one leaves more of κ
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
     """Bound of the distance to the global minimum.
 
-    certified : whether no poses whatever have a χ² lower than this one by more than ``gap``
-    gap : χ² less its lower bound, from 0 up; as large as χ² itself where nothing is known
+    certified : whether no poses have a χ² lower than this one by more than ``gap``
+    gap : χ² minus its lower bound, 0 or more; χ² itself where no bound is known
     chi2 : Σ w eᵀΩe that was certified
     reason : why there is no certificate; empty where there is one
     time_s : wall time
-    is_zero : whether χ² is zero but for rounding
-    left_out : constraints that χ² lacks, in words; empty where there are none
+    is_zero : whether χ² is zero up to rounding
+    left_out : constraints that are not part of χ², as text; empty where there are none
     """
 
     certified: bool
@@ -75,17 +75,17 @@ def certify(
     undetermined: str,
     names: NDArray[np.int64],
 ) -> Certificate:
-    """Bound the global minimum of Σ w eᵀΩe from below, with the weights w (E,) as they stand and any Ω.
+    """Certificate by a lower bound of the global minimum of Σ w eᵀΩe, for fixed weights w (E,) and any Ω.
 
     Every edge's χ² is replaced by a quadratic function of rotations and positions that is nowhere above it and
     touches it at these poses (``minorize``). The Lagrangian dual of that problem (Carlone et al. 2015; Rosen et
     al. 2019, theorem 1) bounds it in turn: if S, with the gauge fixed, is positive definite, then for all poses
-        χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
-    Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
-    factorization goes through, so the claim holds to the rounding of that. A few edges too far from their
-    measurements for such a function, or without information in some direction, are bounded by zero instead: their
-    χ² is part of the gap. What leaves poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,)
-    are what the poses are called.
+        χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to machine precision.
+    Where S is not, μ I is added to its rotation blocks, which lowers the bound. Positive definite means that the
+    Cholesky factorization succeeds, so the claim holds up to its rounding. Edges too far from their measurements
+    for such a function, or without information in some direction, are bounded by zero if their χ² is a small
+    share: it is then part of the gap. Poses that are ``undetermined``, as text, preclude a certificate.
+    ``names`` (K,) are the names of the poses in messages.
     """
     begin = working_s()
     kept = weights > 0.0
@@ -107,7 +107,7 @@ def _gap(
     of_edges: NDArray[np.float64],
     names: NDArray[np.int64],
 ) -> tuple[float, str]:
-    """χ² less its lower bound; where there is none, all of it and why. ``of_edges`` (E,) make up χ²."""
+    """χ² minus its lower bound; without a bound, all of χ² and the reason. ``of_edges`` (E,) sum to χ²."""
     chi2, n, d = float(of_edges.sum()), len(problem.free), poses.shape[-1] - 1
     unknown = ~problem.is_bounded
     if unknown.any():
@@ -146,8 +146,8 @@ def _gap(
 def dual_matrix(problem: GraphProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
     """S = Q − Λ of the bounds of the edges kept (E,), as blocks of the problem's pattern, and S X* (n, d+1, d).
 
-    Unknowns are G_i, the rotation of pose i against its estimate, seen from the world, and t_i, its position; at
-    the estimate X* every G is I. An edge contributes
+    Unknowns are G_i, the rotation of pose i relative to its estimate, in the world frame, and t_i, its position;
+    at the estimate X* every G is I. An edge contributes
         q = τ‖t_j − t_i − G_i l‖² + fᵀG_iᵀ(t_j − t_i) + ½ κ‖G_i − G_j‖² + ½ ⟨[g]×, G_iᵀG_j⟩
     and, by the multiplier Λ_i of G_iᵀG_i = I that makes X* stationary, −½ sym(f lᵀ) at G_i
     (Carlone et al. 2015, eq. 26; Rosen et al. 2019, eq. 22). A row of S belongs to one row of each G and of t.
@@ -157,14 +157,14 @@ def dual_matrix(problem: GraphProblem, bound: Minorants, kept: NDArray[np.bool_]
     d = leap.shape[1]
     R, t = slice(0, d), d
     of_i, of_j, coupling = (np.zeros((len(kept), d + 1, d + 1)) for _ in range(3))
-    bent, stretch = force[:, :, None] * leap[:, None], tau[:, None] * leap
+    bent, tau_leap = force[:, :, None] * leap[:, None], tau[:, None] * leap
     even = 0.5 * kappa[:, None, None] * np.eye(d)
-    of_i[:, R, R] = stretch[:, :, None] * leap[:, None] - 0.25 * (bent + np.swapaxes(bent, 1, 2)) + even
-    of_i[:, R, t] = of_i[:, t, R] = stretch - 0.5 * force
+    of_i[:, R, R] = tau_leap[:, :, None] * leap[:, None] - 0.25 * (bent + np.swapaxes(bent, 1, 2)) + even
+    of_i[:, R, t] = of_i[:, t, R] = tau_leap - 0.5 * force
     of_j[:, R, R] = even
     of_i[:, t, t] = of_j[:, t, t] = tau
-    coupling[:, R, R], coupling[:, R, t], coupling[:, t, t] = 0.25 * torque - even, 0.5 * force - stretch, -tau
-    residual = np.zeros((len(problem.free) + 1, d + 1, d))  # the last one of the fixed poses
+    coupling[:, R, R], coupling[:, R, t], coupling[:, t, t] = 0.25 * torque - even, 0.5 * force - tau_leap, -tau
+    residual = np.zeros((len(problem.free) + 1, d + 1, d))  # the last one is for the fixed poses
     i, j, _ = problem.slots.T
     np.add.at(residual[:, R], i, 0.25 * (bent - np.swapaxes(bent, 1, 2) + torque))
     np.add.at(residual[:, R], j, -0.25 * torque)
@@ -177,13 +177,13 @@ def dual_matrix(problem: GraphProblem, bound: Minorants, kept: NDArray[np.bool_]
 class Minorants:
     """Per edge, χ² ≥ χ²* + τ‖t_j − t_i − G_i l‖² + fᵀ(G_iᵀ(t_j − t_i) − l) + κ tr(I − G_iᵀG_j) + ½⟨[g]×, G_iᵀG_j⟩.
 
-    G_i is the rotation of pose i against its estimate, G_i = R_i R_i*ᵀ, t_i its position, both in the world.
+    G_i is the rotation of pose i relative to its estimate, G_i = R_i R_i*ᵀ, t_i its position, both in the world.
 
     leap : (E, d) l, from pose i to pose j at the estimate, m
     force : (E, d) f, slope of χ² with the position of j
-    torque : (E, d, d) [g]×, slope of χ² with the rotation of j, its position held
+    torque : (E, d, d) [g]×, slope of χ² with the rotation of j at a fixed position
     tau : (E,) m⁻²
-    kappa : (E,) rad⁻²; NaN of an edge too far from its measurement, or too little informative, for any bound
+    kappa : (E,) rad⁻²; NaN for an edge too far from its measurement, or with too little information, for any bound
     """
 
     leap: Matrix
@@ -196,7 +196,7 @@ class Minorants:
 def minorize(problem: GraphProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
     """Bounds that touch the χ² of every edge, times its weight (E,), at these poses.
 
-    They cost a part of its isotropic information, most of it of κ.
+    They use up a part of its isotropic information, mostly of κ.
     """
     d = poses.shape[-1] - 1
     i, j = problem.edges.T
@@ -217,7 +217,7 @@ def minorize(problem: GraphProblem, poses: Matrix, weights: NDArray[np.float64])
     cost += 0.5 * norm(torque - 2.0 * kappa[:, None] * turned)
     kappa = (1.0 - 0.5 * _BEND * theta**2) * (kappa - cost / np.maximum(1.0 - theta, 1e-12))
     kappa[~(kappa > 0.0) | (theta >= _FARTHEST)] = np.nan
-    seen = ~problem.is_whole  # positions: quadratic in that of j, whatever its rotation
+    seen = ~problem.is_whole  # position factors: quadratic in the position of j, independent of its rotation
     left[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], 0.0
     crossed = lie.hat(torque) if d == 3 else torque[:, :, None] * np.array([[0.0, -1.0], [1.0, 0.0]])
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, crossed, left, kappa)

@@ -1,4 +1,4 @@
-"""Sparse Cholesky factorization of a symmetric matrix of blocks; ordering and structure are found once."""
+"""Sparse Cholesky factorization of a symmetric matrix of blocks; ordering and structure are computed once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is roundi
 
 
 class SingularMatrixError(ArithmeticError):
-    """A pivot vanished: the equations leave open the value of this block, ``variable``, and ``scalar`` of all."""
+    """A pivot vanished: the equations do not determine the block ``variable``, at ``scalar`` of all scalars."""
 
     def __init__(self, variable: int, scalar: int) -> None:
         super().__init__(f"variable {variable} is not determined by the equations")
@@ -48,17 +48,17 @@ class BlockPattern:
         counts = self.sizes[self.rows] * self.sizes[self.columns]
         block, within = np.repeat(np.arange(len(counts)), counts), symbolic.ranges(np.zeros_like(counts), counts)
         row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
-        below, beside = np.divmod(within, self.sizes[self.columns][block])
-        row, column, is_pair = row + below, column + beside, row != column
+        in_row, in_column = np.divmod(within, self.sizes[self.columns][block])
+        row, column, is_pair = row + in_row, column + in_column, row != column
         result = np.bincount(row, values * x[column], self.scalars)
         result += np.bincount(column[is_pair], (values * x[row])[is_pair], self.scalars)
         return result.astype(np.float64, copy=False)
 
 
 class Packing:
-    """Blocks of one size k, as kernels fill them, to and from the values of a pattern whose blocks may be smaller.
+    """Conversion between blocks of size k, as kernels fill them, and values of a pattern with smaller blocks.
 
-    A variable of fewer scalars keeps the first of its k rows, or the last.
+    A variable with fewer scalars uses the first of its k rows, or the last ones.
     """
 
     def __init__(self, pattern: BlockPattern, k: int, *, at_end: bool) -> None:
@@ -82,11 +82,11 @@ class Packing:
         return result
 
     def rows(self, vectors: Matrix) -> Matrix:
-        """(scalars, ...) of (n, k, ...)."""
+        """Packed vectors (scalars, ...) of vectors (n, k, ...)."""
         return vectors[self._kept_rows]
 
     def spread_rows(self, packed: Matrix) -> Matrix:
-        """(n, k, ...) of (scalars, ...), zero where none is stored."""
+        """Vectors (n, k, ...) of packed vectors (scalars, ...), zero where none is stored."""
         result = np.zeros((*self._kept_rows.shape, *packed.shape[1:]))
         result[self._kept_rows] = packed
         return result
@@ -103,7 +103,7 @@ class Analysis:
 
 
 def analyze(pattern: BlockPattern, order: NDArray[np.int64] | None = None) -> Analysis:
-    """Fill-in of the factor, the same for blocks of any size; without an order (n,) in a fill-reducing one."""
+    """Symbolic analysis, independent of the block sizes; in a fill-reducing order unless one (n,) is given."""
     ends, n = np.concatenate([pattern.pairs, pattern.pairs[:, ::-1]]).T, len(pattern.sizes)
     links = csr_matrix((np.ones(ends.shape[1]), ends), shape=(n, n))
     start, neighbors = links.indptr.astype(np.int64), links.indices.astype(np.int64)
@@ -183,11 +183,11 @@ class SparseCholesky:
         return result.reshape(right_side.shape)
 
     def covariance_of(self, B: Matrix, variables: NDArray[np.int64]) -> Matrix:
-        """Bᵀ A⁻¹ B (m, m), by the last factor: of x = Bᵀ y, where A is the information of y.
+        """Bᵀ A⁻¹ B (m, m), by the last factor: covariance of x = Bᵀ y, where A is the information of y.
 
         B : (s, m) the scalars of these variables (v,), in their order; it is zero for the others
-        With A = Uᵀ U it is CᵀC, Uᵀ C = B: half of a solve, by the fronts between these variables and the roots of
-        the elimination tree alone.
+        With A = Uᵀ U it is CᵀC, Uᵀ C = B: forward substitution only, over the fronts between these variables and
+        the roots of the elimination tree.
         """
         places = self._places[symbolic.ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
         path, local = self._path(places), np.empty(self._fronts.widest)
@@ -201,7 +201,7 @@ class SparseCholesky:
         return np.asarray(np.einsum("is,js->ij", C, C))
 
     def _path(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Fronts that eliminate these places, and all that follow from them, ascending."""
+        """Fronts that eliminate the scalars at these places, and all their ancestors, ascending."""
         path: set[int] = set()
         for front in np.unique(self._front_of[places]).tolist():
             while front >= 0 and front not in path:
@@ -223,9 +223,9 @@ class SparseCholesky:
 
 
 def _fill_reducing_order(links: csr_matrix) -> NDArray[np.int64]:
-    """Variable to eliminate at each position, by multiple minimum degree (Liu 1985) as SuperLU has it.
+    """Variable to eliminate at each position, by multiple minimum degree (Liu 1985) as implemented in SuperLU.
 
-    An incomplete factorization that drops every entry hands the ordering out without the work of a full one.
+    An incomplete factorization that drops every entry returns the ordering without the work of a full one.
     """
     n = len(links.indptr) - 1
     if n < 2:

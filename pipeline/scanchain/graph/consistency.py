@@ -1,4 +1,4 @@
-"""The consistency of loop edges with all others: edges that agree, taken or dropped one by one or as a group."""
+"""Consistency of loop edges with all other edges, for single edges and for groups of edges that agree."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from scanchain.data import Matrix
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks
 from scanchain.graph.problem import GraphProblem
 
-_ROUNDING = 1e-9  # keeps edges without which their poses would be loose from a division by zero
+_ROUNDING = 1e-9  # avoids a division by zero for edges that alone connect their poses to the graph
 
 
 class Consistency:
     """Squared Mahalanobis distance between what edges measure and what all the other kept edges predict.
 
-    To first order it is what the χ² of the whole graph falls by without edges that are kept, and rises by with
-    others. With P the covariance of the prediction, given all kept edges, it is
+    To first order it is the decrease of the χ² of the whole graph when kept edges are removed, and its increase
+    when rejected edges are added. With P the covariance of the prediction, given all kept edges, it is
         eᵀ(Ω⁻¹ − P)⁻¹e of kept edges,    eᵀ(Ω⁻¹ + P)⁻¹e of others.
-    The residual alone is too small: a kept edge bends the graph toward itself.
+    The χ² of a kept edge by itself is too small, since the edge pulls the graph toward its own measurement.
     """
 
     def __init__(self, problem: GraphProblem, poses: Matrix, kept: NDArray[np.bool_]) -> None:
@@ -35,10 +35,10 @@ class Consistency:
         self._sparse = problem.factored(poses, self._errors, kept)
 
     def of_each(self, price: float) -> NDArray[np.float64]:
-        """The distance of every edge, (E,), from all others.
+        """Distance of every edge, (E,), from all others.
 
-        Where a lower bound of that of an edge left out, by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is above the price
-        already, the bound is given.
+        If a lower bound of the distance of a rejected edge, by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is already above
+        the price, the bound is returned.
         """
         problem, kept, every = self._problem, self._kept, np.arange(len(self._kept))
         blocks = inverse_blocks(self._sparse)
@@ -53,7 +53,7 @@ class Consistency:
         return result
 
     def of_group(self, group: NDArray[np.int64]) -> float:
-        """The distance of the edges of a group, all of them kept or none, from all others."""
+        """Distance of a group of edges, all of them kept or none, from all others."""
         k, count = self._problem.freedom, len(group)
         J = self._jacobians[group]
         joint = difference_covariances(self._sparse, self._problem.edges[group])  # at [b, a]
@@ -65,31 +65,31 @@ class Consistency:
         return float(_distances(self._errors[group].reshape(1, size), omega, P, self._kept[group[:1]])[0])
 
     def _distances(self, edges: NDArray[np.int64], joint: Matrix) -> NDArray[np.float64]:
-        """Those of single edges (N,), from the covariances (N, k, k) of ξ_j − ξ_i."""
+        """Distances of single edges, (N,), from the covariances (N, k, k) of ξ_j − ξ_i."""
         J = self._jacobians[edges]
         predicted = J @ joint @ np.swapaxes(J, 1, 2)
         return _distances(self._errors[edges], self._problem.information[edges], predicted, self._kept[edges])
 
 
 def _distances(e: Matrix, omega: Matrix, P: Matrix, kept: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """eᵀ(Ω⁻¹ ∓ P)⁻¹e = eᵀΩ(I ∓ PΩ)⁻¹e, (N,), of residuals (N, m) that are kept or not."""
+    """eᵀ(Ω⁻¹ ∓ P)⁻¹e = eᵀΩ(I ∓ PΩ)⁻¹e, (N,), from residuals (N, m) of edges that are kept or not."""
     sign = np.where(kept, -1.0, 1.0)[:, None, None]
     matrix = (1.0 + _ROUNDING) * np.eye(e.shape[1]) + sign * (P @ omega)
     return (e[:, None] @ omega @ np.linalg.solve(matrix, e[..., None]))[:, 0, 0]
 
 
 FEWEST = 3  # least number of edges of a group; fewer may agree by chance
-_REACH = 5  # largest difference of the poses of two agreeing edges, at either end, in the order of the poses
-_MOST = 50  # largest number of edges of a group that is looked at as one
-_AT_ONCE = 10_000  # pairs of edges that are compared at once, of many
+_REACH = 5  # largest difference between the pose indices of two agreeing edges, at either end
+_MOST = 50  # largest number of edges of a group that is tested as one; larger groups are not
+_AT_ONCE = 10_000  # about the largest number of pairs of edges compared in one call
 
 
 def agreeing_groups(
     problem: GraphProblem, poses: Matrix, chosen: NDArray[np.bool_], limit: float
 ) -> list[NDArray[np.int64]]:
-    """Loop edges of each group among those chosen (E,): they join the same two segments of poses and agree there.
+    """Groups of loop edges among those chosen (E,) that join the same two segments of the trajectory and agree.
 
-    Two agree where one predicts the other along the poses between their ends: the squared Mahalanobis distance,
+    Two edges agree if one predicts the other along the poses between their ends: the squared Mahalanobis distance,
     with the noise of both and of an odometry edge for each of these poses, is below the limit.
     """
     loops = np.flatnonzero(chosen & problem.is_loop)
@@ -111,7 +111,7 @@ def agreeing_groups(
 
 
 def carried(poses: Matrix, edges: NDArray[np.int64], Z: Matrix, others: NDArray[np.int64]) -> Matrix:
-    """What edges (P, 2) that measure Z predict of other pairs (P, 2), along the poses between their ends."""
+    """Relative poses of other pairs (P, 2), predicted by edges (P, 2) that measure Z and the poses between."""
     before = lie.between(poses[others[:, 0]], poses[edges[:, 0]])
     after = lie.between(poses[edges[:, 1]], poses[others[:, 1]])
     return before @ Z @ after
@@ -120,7 +120,7 @@ def carried(poses: Matrix, edges: NDArray[np.int64], Z: Matrix, others: NDArray[
 def connected(
     pairs: NDArray[np.int64], count: int, agree: Callable[..., NDArray[np.bool_]]
 ) -> list[NDArray[np.int64]]:
-    """Groups of at least ``FEWEST`` of so many, connected by pairs (P, 2) that agree: a (P,) and b (P,), bool."""
+    """Connected groups, at least ``FEWEST`` of ``count`` items each, by the pairs (P, 2) for which agree(a, b)."""
     parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
     a, b = pairs[np.concatenate([agree(*part.T) for part in parts])].T
     label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)[1]
@@ -130,7 +130,7 @@ def connected(
 
 
 def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Those of the edges that join other poses than the ones before: a mistake repeated does not count twice."""
+    """Edges without an earlier chosen one near both of their ends: a repeated mistake does not count twice."""
     is_chosen = np.zeros(len(edges), np.bool_)
     for place, near in enumerate(KDTree(ends[edges]).query_ball_point(ends[edges], _REACH, p=np.inf)):
         is_chosen[place] = not is_chosen[near].any()

@@ -1,4 +1,4 @@
-"""Covariances of poses from the factor of H, without its inverse, and as a table."""
+"""Covariances of poses from the Cholesky factor of H, without forming its inverse; written as a CSV table."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def responses(problem: GraphProblem, i: int, j: int) -> Matrix:
 def difference_covariances(problem: GraphProblem, pairs: NDArray[np.int64]) -> Matrix:
     """Cov(ξ_j − ξ_i, ξ_b − ξ_a), (P, P, k, k), at [(a, b), (i, j)], of the left twists of pairs (P, 2) of poses.
 
-    By the factor of H, as far as it concerns these poses.
+    Only the part of the factor of H between these poses and the root of the elimination tree is used.
     """
     k, count = problem.freedom, len(pairs)
     ends = problem.variable[pairs]
     variables = np.unique(ends[ends >= 0])
-    place = np.where(ends >= 0, np.searchsorted(variables, ends), len(variables))  # the last one: fixed poses
+    place = np.where(ends >= 0, np.searchsorted(variables, ends), len(variables))  # the last: fixed poses
     moves = np.zeros((len(variables) + 1, k, count, k))
     for pair, (i, j) in enumerate(place.tolist()):
         moves[j, :, pair] += np.eye(k)
@@ -47,22 +47,22 @@ def difference_covariances(problem: GraphProblem, pairs: NDArray[np.int64]) -> M
 
 
 def inverse_blocks(problem: GraphProblem) -> Matrix:
-    """Blocks (…, k, k) of H⁻¹ where H may be nonzero, and a last one of zeros, found by −1, of the fixed poses."""
+    """Blocks (…, k, k) of H⁻¹ where H may be nonzero, and at index −1 a block of zeros for fixed poses."""
     blocks = problem.packing.blocks(problem.cholesky.inverse_blocks())
     return np.concatenate([blocks, np.zeros((1, *blocks.shape[1:]))])
 
 
 def edge_covariances(problem: GraphProblem, blocks: Matrix) -> Matrix:
-    """Cov(ξ_j − ξ_i), (E, k, k), of the left twists of the ends of every edge, of these ``inverse_blocks``."""
+    """Cov(ξ_j − ξ_i), (E, k, k), of the left twists at the ends of every edge, from ``inverse_blocks``."""
     i, j, pair = problem.slots.T
     return blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
 
 
 def displacements(problem: GraphProblem, poses: Matrix, weight: NDArray[np.float64], changes: Matrix) -> Matrix:
-    """Changes (G, K, k) of all poses, to first order, where the measured motions T_ij become T_ij exp(change).
+    """First-order changes (G, K, k) of all poses when the measured motions T_ij become T_ij exp(change).
 
     changes : (G, E, k) twists in the frame of j. The left twists ξ of the poses solve H ξ = Σ w JᵀΩ change;
-    returned are changes of position and orientation, along the world's axes.
+    the result contains changes of position and orientation along the world's axes.
     """
     result = np.zeros((len(changes), len(poses), problem.freedom))
     for moved, change in zip(result, changes, strict=True):
@@ -72,22 +72,22 @@ def displacements(problem: GraphProblem, poses: Matrix, weight: NDArray[np.float
 
 
 def pose_errors(problem: GraphProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
-    """Errors (count, K, k) of all poses, drawn from their joint distribution; those of fixed poses are zero.
+    """Errors (count, K, k) of all poses, sampled from their joint distribution; those of fixed poses are zero.
 
-    Of the linearized problem with H = Uᵀ U: left twists ξ = U⁻¹ z of independent normal z move a position t by
-    ρ + φ × t. (Moving the poses by exp(ξ) overstates the errors where these are large.) Returned are that and φ,
-    along the world's axes.
+    In the linearized problem with H = Uᵀ U, left twists ξ = U⁻¹ z, with z standard normal, move a position t by
+    ρ + φ × t. (Moving the poses by exp(ξ) would overstate large errors.) The result contains this displacement
+    and φ, along the world's axes.
     """
     random = np.random.default_rng(seed)
     errors = np.zeros((count, len(poses), problem.freedom))
     for k in range(count):
-        drawn = problem.cholesky.draw(random.normal(size=problem.pattern.scalars))
-        errors[k, problem.free] = _moved(problem, poses, drawn)
+        sampled = problem.cholesky.draw(random.normal(size=problem.pattern.scalars))
+        errors[k, problem.free] = _moved(problem, poses, sampled)
     return errors
 
 
 def _moved(problem: GraphProblem, poses: Matrix, packed: NDArray[np.float64]) -> Matrix:
-    """(n, k) changes of position and orientation of the free poses, moved by left twists."""
+    """Changes (n, k) of position and orientation of the free poses by left twists."""
     d = poses.shape[-1] - 1
     twists = problem.packing.spread_rows(packed)
     twists[:, :d] += (turns(poses[problem.free, :d, d]) @ twists[:, d:, None])[..., 0]
@@ -95,13 +95,13 @@ def _moved(problem: GraphProblem, poses: Matrix, packed: NDArray[np.float64]) ->
 
 
 def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Places among ``ids`` (K,) of the poses that ``all`` or ``0,7,12`` name."""
+    """Indices in ``ids`` (K,) of the poses named by ``all`` or ``0,7,12``."""
     if text.strip() == "all":
         return np.arange(len(ids))
     try:
         wanted = [int(word) for word in text.split(",")]
     except ValueError:
-        raise InputError(f"--marginals is {text!r}; take all, or vertex ids with commas between them") from None
+        raise InputError(f"--marginals is {text!r}; give all, or vertex ids separated by commas") from None
     place = {name: index for index, name in enumerate(ids.tolist())}
     for unknown in sorted(set(wanted) - set(place))[:1]:
         raise InputError(f"--marginals {unknown}: no such vertex; the ids go from {ids.min()} to {ids.max()}")
@@ -109,9 +109,10 @@ def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def write_covariances(path: Path, ids: NDArray[np.int64], covariances: Matrix) -> None:
-    """Write a CSV file, a line a pose: its id and the upper triangle of its covariance (K, k, k).
+    """Write a CSV file with one line per pose: its id and the upper triangle of its covariance (K, k, k).
 
-    Of twists in the pose's own frame, T exp(ξ), order (translation, rotation): m², m rad, rad². Raises OSError.
+    The twists are in the pose's own frame, T exp(ξ), order (translation, rotation): m², m rad, rad². Raises
+    OSError.
     """
     names = _NAMES[covariances.shape[-1]]
     upper = np.triu_indices(len(names))

@@ -1,4 +1,4 @@
-"""Checks of edges that users give: numbers, and poses that they leave free."""
+"""Checks of the edges of a graph: valid numbers, connectivity, and poses that the edges leave free."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from scanchain.graph.problem import GraphProblem
 from scanchain.kernels.geometry import largest_magnitude
 
 _MOST = 100  # largest number of directions of the null space that are computed
-_MOVES = 1e-6  # share of the largest component of a null vector below which a pose stays where it is
+_MOVES = 1e-6  # share of the largest component of a null vector below which a pose does not move
 _NOTHING = 1e-20  # share of the largest entry up to which a diagonal entry is rounding noise
-_FREE = 1e-11  # share of the information of a pose alone up to which what is left of it beside the others is none
-_WEAK = 1e-6  # share of the median information up to which an edge is a weak one
-_LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
+_FREE = 1e-11  # share of a diagonal entry of H up to which its pivot in the factorization counts as zero
+_WEAK = 1e-6  # share of the median information up to which an edge is weak
+_LOST = 1e-10  # share of the median information up to which an axis of an edge is lost to rounding in H
 
 
 def free_text(names: NDArray[np.int64]) -> str:
@@ -38,10 +38,11 @@ def free_poses(
 ) -> NDArray[np.int64]:
     """Names of the poses that move in some direction without any change of χ², at these poses and weights (E,).
 
-    ranks (E,) are those of the information matrices. Where edges of full rank, weak along no axis, join every pose
-    to a fixed one, nothing is free. Else those that move in the null space of H, without the axes along which an
-    edge says next to nothing: every pivot of H that vanishes gets a prior, and with H' = H + Σ h e eᵀ over these,
-    the null space is spanned by the columns of H'⁻¹ e, each of which moves one of these scalars alone.
+    ranks (E,) are those of the information matrices. If edges of full rank, weak along no axis, join every pose to
+    a fixed one, no pose is free. Otherwise the free poses are those that move in the null space of H, which is
+    computed without the axes along which an edge has almost no information. Every vanishing pivot of H gets a
+    prior; with H' = H + Σ h e eᵀ over these, the null space is spanned by the columns of H'⁻¹ e, each of which
+    moves only one of these scalars.
     """
     pattern, kept, shares = problem.pattern, weights > 0.0, _shares(problem.information)
     is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > _WEAK)
@@ -75,13 +76,13 @@ def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[
 
 
 def weak_text(names: NDArray[np.int64]) -> str:
-    """Poses that hang on weak edges as one line of text."""
+    """Poses constrained only by weak edges, as one line of text."""
     group = f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
     return f"{group} by edges of less than a millionth of the usual information"
 
 
 def _shares(information: Matrix) -> Matrix:
-    """Diagonals of information matrices (E, k), over the medians for positions and rotations."""
+    """Diagonals (E, k) of information matrices, divided by the medians for positions and rotations."""
     d = 2 if information.shape[-1] == 3 else 3
     result = np.einsum("eaa->ea", information).copy()
     for part in (result[:, :d], result[:, d:]):
@@ -100,7 +101,7 @@ def own_equations(problem: GraphProblem, poses: Matrix, information: Matrix) -> 
     return problem.packing.values(blocks)
 
 
-_NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
+_NO_INFORMATION = 1e-9  # eigenvalue of a matrix scaled to unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
 
 
@@ -112,9 +113,9 @@ def check_edges(
     *,
     with_origin: bool = False,
 ) -> None:
-    """Refuse edges to unknown poses, from a pose to itself, or with impossible numbers.
+    """Raise InputError for edges to unknown poses, from a pose to itself, or with invalid numbers.
 
-    with_origin : whether they may begin at the origin of the world
+    with_origin : whether edges may begin at the origin of the world
     """
     least = np.array([ORIGIN if with_origin else 0, 0])
     is_known = ((edges >= least) & (edges < pose_count)).all(axis=1)
@@ -160,7 +161,7 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
 
 
 def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64]) -> None:
-    """Refuse a graph with poses that no chain of edges joins to a fixed one; ``names`` (K,) are the poses'."""
+    """Raise InputError if no chain of edges joins some pose to a fixed one; ``names`` (K,) are the poses'."""
     if not len(fixed):
         raise InputError("the pose graph has no poses; add some before optimizing")
     apart = loose(edges, fixed)
@@ -183,12 +184,12 @@ def loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int6
 
 
 def has_loop(edges: NDArray[np.int64], pose_count: int) -> bool:
-    """True if there are more edges than a spanning forest of them has."""
+    """True if there are more edges than in a spanning forest."""
     return len(edges) > pose_count - _parts(edges, pose_count)[0]
 
 
 def skip_poses(edges: NDArray[np.int64], is_point: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """True for edges (E, 2) between poses that do not follow each other, as loops do; is_point (K,)."""
+    """True for edges (E, 2) between non-consecutive poses, neither of them a point; is_point (K,)."""
     return (np.abs(edges[:, 1] - edges[:, 0]) != 1) & ~is_point[edges].any(axis=1)
 
 

@@ -1,4 +1,4 @@
-"""Errors of odometry that would explain closures left out: the search for the best, one after the other."""
+"""Greedy search for odometry errors that explain rejected loop closures."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from scanchain.graph.odometry_errors import (
 from scanchain.graph.optimization import Since, solve
 from scanchain.graph.problem import GraphProblem
 
-_LARGE = 2000  # edges of odometry from which on groups of loop edges are judged once, under the last explanation
-_FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
+_LARGE = 2000  # odometry edges at or above which groups of loop edges are not judged in trials, only at the end
+_FEWEST = 2  # least number of rejected loop edges, none near another, for which an explanation is searched
 _MAX_STEPS = 20  # largest number of changes of an explanation in one optimization
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
-_MOST_LEFT_OUT = 30  # largest number of loop edges that are looked at
-_MOST_ENTRIES = 4_000_000  # largest number of covariances between these and odometry, 32 MB
-_SLIP_LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
-_MOST_STRETCHES = 100  # largest number of stretches that are looked at more closely
-_CURVATURE = 0.3  # share of a change by a drift that its linearization may be off by
-_DRIFT_ROUNDS = 3  # of which each knows better how far off it is
-_ROUNDS = 3  # of the least squares over the loop edges that one explains
+_MOST_LEFT_OUT = 30  # largest number of rejected loop edges that are evaluated
+_MOST_ENTRIES = 4_000_000  # largest number of entries of the covariances between these and odometry, 32 MB
+_SLIP_LENGTHS = (4, 16, 64)  # numbers of edges of the segments that are tried
+_MOST_SEGMENTS = 100  # largest number of segments that are evaluated without the estimates of the bound
+_CURVATURE = 0.3  # standard deviation of the linearization error of a drift, as a share of the change by it
+_DRIFT_ROUNDS = 3  # rounds, each with a better estimate of that error
+_ROUNDS = 3  # rounds of least squares over the loop edges that an error explains
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +55,11 @@ class Explained:
 
 @dataclass(frozen=True, slots=True)
 class Explainer:
-    """Optimizes a graph with explanations that lower the cost by more than they cost themselves.
+    """Optimizes a graph and accepts odometry errors (explanations) that lower its cost by more than their own.
 
     problem_of : the problem under an explanation
     measured, information : (E, ...) of all edges, as added
-    jumps : whether to look for jumps rather than for a drift, which is one of all odometry
+    jumps : whether to search for jumps instead of a drift, which is common to all odometry
     """
 
     problem_of: Callable[[Explanation], GraphProblem]
@@ -89,7 +89,7 @@ class Explainer:
         return best
 
     def _better(self, best: Explained) -> Explained:
-        """The same under the most promising explanation that lowers the cost; itself where none does."""
+        """Minimum under the most promising explanation that lowers the cost; ``best`` itself if none does."""
         price, poses = best.minimum.price, best.minimum.estimate.poses
         for explanation in self._candidates(best):
             trial = self._solved(explanation, poses, "given", groups=not self._is_large(best))
@@ -98,7 +98,7 @@ class Explainer:
         return best
 
     def _candidates(self, best: Explained) -> list[Explanation]:
-        """Explanations that may lower the cost, those that promise most first."""
+        """Explanations that may lower the cost, the most promising first."""
         problem, now, price = best.problem, best.explanation, best.minimum.price
         kept = best.minimum.weights > REJECTED_WEIGHT
         rejected = np.flatnonzero(problem.is_loop & ~kept)
@@ -113,9 +113,9 @@ class Explainer:
             found.append((gain, replace(now, drift=now.drift + change)))
         for is_jump in (False, True)[: 1 + self.jumps]:
             measured, costs = self.measured[odometry], (price, self._nominal)
-            gain, stretch = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
-            if stretch is not None:
-                found.append((gain, replace(now, loosened=(*now.loosened, stretch))))
+            gain, segment = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
+            if segment is not None:
+                found.append((gain, replace(now, loosened=(*now.loosened, segment))))
         found.sort(key=lambda each: -each[0])
         return [explanation for gain, explanation in found if gain > _SETTLED * price]
 
@@ -146,29 +146,29 @@ class Explainer:
 
     @property
     def _nominal(self) -> float:
-        """Price of a loop edge left out where the noise model is right."""
+        """Price of a rejected loop edge if the noise model is right."""
         d = self.measured.shape[-1] - 1
         return rejection_limit(self.config.robust_scale, d * (d + 1) // 2)
 
 
 class LeftOut:
-    """Loop edges that a minimum leaves out, L of them, and how odometry would change them, to first order.
+    """The L loop edges that a minimum rejects, and their first-order response to changes of odometry.
 
-    None is near another: those near each other may share a mistake.
+    None is near another, since edges near each other may share a mistake.
 
     problem, factored : all edges, and those kept with H factored at the poses
-    edges : (L,) these loop edges, each of them for ``stride`` such edges
+    edges : (L,) these loop edges, each of which represents ``stride`` such edges
     odometry : (O,) the edges of odometry in the order of the poses
     errors, jacobians : (E, k), (E, k, k) residuals e and ∂e/∂ξ_j of all edges
-    covariances : (L, k, k) of their residuals, by their own noise and the graph without them
-    predicted : (O, k, k) covariances of what the graph predicts of odometry
-    joint : (L, O, k, k) covariances of the left twists of both, Cov(ξ_end − ξ_begin, ξ_j − ξ_i)
+    covariances : (L, k, k) of their residuals, from their own noise and from the graph without them
+    predicted : (O, k, k) covariances of odometry as predicted by the graph
+    joint : (L, O, k, k) cross-covariances of the left twists of both, Cov(ξ_end − ξ_begin, ξ_j − ξ_i)
     """
 
     def __init__(
         self, problem: GraphProblem, poses: Matrix, odometry: NDArray[np.int64], kept: NDArray[np.bool_]
     ) -> None:
-        """Those of a minimum with the edges kept (E,)."""
+        """Rejected loop edges of a minimum with the edges kept (E,)."""
         edges = apart(problem.edges, np.flatnonzero(problem.is_loop & ~kept))
         most = min(_MOST_LEFT_OUT, _MOST_ENTRIES // (max(len(odometry), 1) * problem.freedom**2))
         self.stride = max(1, -(-len(edges) // max(most, 1)))
@@ -189,9 +189,9 @@ class LeftOut:
             self.joint[place] = moved[end] - moved[begin]
 
     def weighed(self, spread: Matrix | float = 0.0) -> tuple[Matrix, Matrix]:
-        """Residuals (L, k) of these loop edges, and their information (L, k, k), each for all it stands for.
+        """Residuals (L, k) of these loop edges, and their information (L, k, k), multiplied by ``stride``.
 
-        spread : further standard deviations (L, k)
+        spread : additional standard deviations (L, k)
         """
         k = self.errors.shape[1]
         noise = self.covariances + np.square(spread)[..., None] * np.eye(k)
@@ -199,14 +199,14 @@ class LeftOut:
         return self.errors[self.edges], information
 
     def shifts(self, twists: Matrix, among: slice = slice(None)) -> Iterator[Matrix]:
-        """∂e (n, k, p) of each of these loop edges, by right twists (n, k, p) on some edges of odometry."""
+        """Changes ∂e (n, k, p) of the residual of each of these loop edges by right twists (n, k, p) of edges."""
         problem, odometry = self.problem, self.odometry[among]
         pull = np.swapaxes(self.jacobians[odometry], 1, 2) @ (problem.information[odometry] @ twists)
         for edge, joint in zip(self.edges, self.joint[:, among], strict=True):
             yield self.jacobians[edge] @ (np.swapaxes(joint, 1, 2) @ pull)
 
     def quadratic(self, twists: Matrix, among: slice = slice(None)) -> tuple[NDArray[np.float64], Matrix]:
-        """Slope b (p,) and curvature A (p, p) of right twists τ (n, k, p) on some edges of odometry.
+        """Slope b (p,) and curvature A (p, p) of the cost along right twists τ (n, k, p) of odometry edges.
 
         With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ; the cost of the kept edges changes by δᵀAδ − 2 bᵀδ,
         where A = Σ τᵀΩτ − gᵀH⁻¹g and b = Σ τᵀΩe.
@@ -230,9 +230,9 @@ class LeftOut:
 
 
 def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
-    """The fall of the cost by a change of the drift, to first order, and this change.
+    """First-order decrease of the cost by the best change of the drift, and this change.
 
-    Each round counts the error of the linearization, a share of the change that the last round found, as noise.
+    Each round treats the error of the linearization, a share of the change found in the last round, as noise.
     """
     odometry = left_out.odometry
     twists = lie.log(left_out.problem.measurements[odometry])
@@ -262,21 +262,21 @@ def next_loosened(
     *,
     is_jump: bool,
 ) -> tuple[float, Loosened | None]:
-    """The fall of the cost by one more slip or jump, to first order, and this; None where none lowers it.
+    """First-order decrease of the cost by the best additional slip or jump, and this; None if none lowers it.
 
-    measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
-    Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included, and by what each loop edge
-    left out then costs less than its price: min(price, (e + V t)ᵀC⁻¹(e + V t)). Each of them gives a candidate.
+    measured : (O, d+1, d+1) measurements of odometry, in the order of ``left_out.odometry``
+    Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included. A rejected loop edge then
+    costs min(price, (e + V t)ᵀC⁻¹(e + V t)) instead of its price. Each of these edges gives a candidate t.
 
-    A takes a solve, so that stretches are tried in the order of a bound, for which each loop edge has errors of
-    its own at its share of that change, and A is estimated: along a chain whose ends are well known, the
-    information on a slip of all edges is what they claim, that on a slip of one the share of its redundancy; these
-    add up to one.
+    A requires a linear solve, so that segments are tried in the order of a bound. In the bound, each loop edge has
+    errors t of its own, at its share of that change, and A is estimated: along a chain with accurate ends, the
+    information on a slip of all edges is that of the edges themselves, and on a slip of one edge the share given
+    by its redundancy; these shares add up to one.
     """
-    tried = _stretches(len(measured), others, is_jump=is_jump)
+    tried = _segments(len(measured), others, is_jump=is_jump)
     if not tried:
         return 0.0, None
-    first, count = np.array([(stretch.first, stretch.count) for stretch in tried]).T
+    first, count = np.array([(segment.first, segment.count) for segment in tried]).T
     information = left_out.problem.information[left_out.odometry]
     B = spread(measured, information, is_jump=is_jump)
     pull = information @ B
@@ -288,7 +288,7 @@ def next_loosened(
     b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
     costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
     e, M, price = *left_out.weighed(), left_out.stride * price
-    alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained
+    alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without explaining any of them
     hoped = -costs
     for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):
         V = _means(shift, first, count)
@@ -297,20 +297,20 @@ def next_loosened(
         fall = (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1) + price - error @ weight @ error
         hoped += np.maximum(fall, alone)
     most, best = 0.0, None
-    for index in np.argsort(-hoped, kind="stable")[:_MOST_STRETCHES]:
+    for index in np.argsort(-hoped, kind="stable")[:_MOST_SEGMENTS]:
         if not hoped[index] > most:
             break
-        stretch, twists = tried[index], B[tried[index].edges] / count[index]
-        slope, curvature = left_out.quadratic(twists, stretch.edges)
-        V = np.stack([shift.sum(axis=0) for shift in left_out.shifts(twists, stretch.edges)])
+        segment, twists = tried[index], B[tried[index].edges] / count[index]
+        slope, curvature = left_out.quadratic(twists, segment.edges)
+        V = np.stack([shift.sum(axis=0) for shift in left_out.shifts(twists, segment.edges)])
         fall, _ = _largest_fall(unit + curvature, slope, e, M, V, price)
         if fall - costs[index] > most:
-            most, best = fall - float(costs[index]), stretch
+            most, best = fall - float(costs[index]), segment
     return most, best
 
 
 def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: float) -> tuple[float, Vector]:
-    """Largest fall of the cost by errors (p,) of odometry that explain a loop edge, and the errors.
+    """Largest decrease of the cost by odometry errors (p,) that explain at least one loop edge, and these errors.
 
     A (p, p), b (p,) : of these errors, prior included; e, M, V : (L, ...) of the loop edges
     """
@@ -330,13 +330,13 @@ def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: 
 
 
 def _means(each: Matrix, first: NDArray[np.int64], count: NDArray[np.int64]) -> Matrix:
-    """Mean (S, ...) over the edges of each stretch, of values (O, ...)."""
+    """Mean (S, ...) over the edges of each segment, of values (O, ...)."""
     sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
     return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
 
 
-def _stretches(edges: int, others: tuple[Loosened, ...], *, is_jump: bool) -> list[Loosened]:
-    """Stretches of every length, of so many edges, that overlap none of the others, each half beside the last."""
+def _segments(edges: int, others: tuple[Loosened, ...], *, is_jump: bool) -> list[Loosened]:
+    """Segments of every length among this many edges, each shifted by half its length, that overlap no others."""
     return [
         Loosened(first, length, is_jump)
         for length in ((1,) if is_jump else _SLIP_LENGTHS)

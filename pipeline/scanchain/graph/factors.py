@@ -12,17 +12,17 @@ from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.kernels.graph import between
 
-ORIGIN = -1  # for the i of an edge that concerns one pose only: the origin of the world, which is fixed
-_STEP = 1e-6  # m or rad, of central differences: the cube root of the rounding
+ORIGIN = -1  # index i of a unary edge: the origin of the world, which is fixed
+_STEP = 1e-6  # m or rad, step of central differences: of the order of the cube root of machine epsilon
 
 
 class Factor:
-    """A kind of edges: the residual e(T_ij, Z) of the pose of j seen from i, T_ij = T_i⁻¹ T_j, that measures Z.
+    """A kind of edge: the residual e(T_ij, Z) of the relative pose T_ij = T_i⁻¹ T_j and its measurement Z.
 
-    A factor of one's own defines ``name`` and ``error``, ``jacobian`` where that should be exact, and enters a
-    graph by ``PoseGraph.add_factor``.
+    A custom factor defines ``name`` and ``error``, and ``jacobian`` if it should be exact, and is added to a graph
+    by ``PoseGraph.add_factor``.
 
-    name : in messages; is_robust : whether edges have the robust loss, so that they can be rejected
+    name : shown in messages; is_robust : whether edges have the robust loss, so that they can be rejected
     is_bounded : whether the certificate has a lower bound of χ²
     """
 
@@ -31,7 +31,7 @@ class Factor:
     is_bounded: bool = False
 
     def stands_for(self, other: Factor) -> bool:
-        """Whether another is the same kind: of the same class, neither with parameters of its own."""
+        """Whether another is of the same kind: of the same class, neither with parameters of its own."""
         return type(self) is type(other) and not vars(self) and not vars(other)
 
     def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
@@ -49,7 +49,7 @@ class Factor:
         return np.stack(columns, axis=-1)
 
     def check(self, T_ij: Pose, Z: Pose, count: int) -> None:
-        """Refuse a factor whose residuals at a pose are not so many finite numbers."""
+        """Raise InputError if the residuals at a pose are not ``count`` finite numbers."""
         found = np.asarray(self.error(T_ij[None], Z[None]))
         if found.shape != (1, count) or not np.isfinite(found).all():
             wanted = f"finite numbers of the shape (1, {count}), as information is {count} x {count}"
@@ -65,7 +65,7 @@ class Factor:
     def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
         """∂e/∂ξ_j (E, k, k) for left twists, T_j ← exp(ξ_j) T_j, where the residuals are these errors (E, k).
 
-        Since e depends on T_i⁻¹ T_j alone, one and the same left twist of both poses changes nothing, and
+        Since e depends on T_i⁻¹ T_j alone, the same left twist of both poses changes nothing, and
         ∂e/∂ξ_i = −∂e/∂ξ_j.
         """
         T_i, T_j = poses[edges.T]
@@ -76,23 +76,23 @@ class Factor:
 
 
 class Between(Factor):
-    """e = log(Z⁻¹ T_i⁻¹ T_j): the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e)."""
+    """e = log(Z⁻¹ T_i⁻¹ T_j): the right twist from the measurement to the relative pose, T_i⁻¹ T_j = Z exp(e)."""
 
     is_bounded = True
 
     def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
-        """As of ``Factor``."""
+        """See ``Factor``."""
         return lie.log(lie.between(Z, T_ij))
 
     def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
-        """As of ``Factor``, compiled."""
+        """See ``Factor``; compiled."""
         errors = np.empty((len(edges), lie.twist_size(poses)))
         residuals = between.residuals_2d if errors.shape[1] == 3 else between.residuals_3d
         residuals(read_only(poses), read_only(edges), read_only(Z), errors)
         return errors
 
     def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
-        """As of ``Factor``, compiled."""
+        """See ``Factor``; compiled."""
         jacobian = np.empty((*errors.shape, errors.shape[1]))
         if errors.shape[1] == 3:
             between.jacobians_2d(read_only(poses), read_only(edges), read_only(Z), jacobian)
@@ -108,25 +108,25 @@ class Odometry(Between):
 
 
 class Loop(Between):
-    """The pose at a revisit, which may be wrong."""
+    """The relative pose at a revisit, which may be an outlier."""
 
     name = "loop"
     is_robust = True
 
 
 class Position(Factor):
-    """e = R_zᵀ(R_iᵀ(t_j − t_i) − t_z): the position of j in frame i, whatever its rotation, as g2o has it."""
+    """e = R_zᵀ(R_iᵀ(t_j − t_i) − t_z): the position of j in frame i, whatever its rotation, as in g2o."""
 
     name = "position"
     is_bounded = True
 
     def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
-        """As of ``Factor``."""
+        """See ``Factor``."""
         d = Z.shape[-1] - 1
         return ((T_ij[:, None, :d, d] - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
 
     def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
-        """As of ``Factor``, without the rotation of j."""
+        """See ``Factor``; computed without the rotation of j."""
         d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
         seen = (T_j[:, None, :d, d] - T_i[:, None, :d, d]) @ T_i[:, :d, :d]
         errors = np.zeros((len(edges), lie.twist_size(poses)))
@@ -155,16 +155,16 @@ class Sighting(Position):
 
 
 class LoopSighting(Sighting):
-    """The position at a revisit, of a loop that measures no rotation."""
+    """The position at a revisit: a loop that measures no rotation."""
 
     name = "loop"
     is_robust = True
 
 
 FACTORS: tuple[Factor, ...] = (Odometry(), Loop(), Sighting(), LoopSighting(), Prior(), Position())
-ODOMETRY, LOOP, SIGHTING, LOOP_SIGHTING, PRIOR, _ = range(len(FACTORS))  # kind of an edge: its place in the table
+ODOMETRY, LOOP, SIGHTING, LOOP_SIGHTING, PRIOR, _ = range(len(FACTORS))  # kind of an edge: index in the table
 LOOPS, SIGHTINGS = (LOOP, LOOP_SIGHTING), (SIGHTING, LOOP_SIGHTING)
-WHOLE = (ODOMETRY, LOOP, PRIOR)  # that measure position and rotation
+WHOLE = (ODOMETRY, LOOP, PRIOR)  # kinds that measure position and rotation
 
 
 def kinds_of(
@@ -184,7 +184,7 @@ def kinds_of(
 
 
 def of_residuals(information: Matrix, freedom: int, factor: Factor) -> Matrix:
-    """Ω (k, k) of a factor's m residuals, of theirs (m, m), zero from m on."""
+    """Ω (k, k) of a factor: the information (m, m) of its m residuals, padded with zeros."""
     shape = np.shape(information)
     count = shape[0] if shape else 0
     if not 0 < count <= freedom:
@@ -204,7 +204,7 @@ def turns(positions: Matrix) -> Matrix:
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """A read-only view: for one kind of array a kernel is compiled once."""
+    """A read-only view, so that a kernel is compiled for one kind of array only."""
     view = array.view()
     view.flags.writeable = False
     return view

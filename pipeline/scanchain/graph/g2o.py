@@ -23,9 +23,9 @@ from scanchain.graph.factors import Position, Prior
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
 
-_NO_CONSTRAINT = ("#", "VERTEX", "PARAMS", "FIX")  # how lines begin that constrain nothing
-_WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
-Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
+_NO_CONSTRAINT = ("#", "VERTEX", "PARAMS", "FIX")  # beginnings of lines that constrain nothing
+_WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is more than a full turn, or in degrees
+Rotation = Literal["vector", "quaternion"]  # rotation parametrization of Ω in 3D
 ROTATION_COMMENT: dict[Rotation, str] = {
     "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
     "quaternion": "# information of EDGE_SE3:QUAT is of (translation, vector part of unit quaternion), as g2o",
@@ -36,9 +36,9 @@ class Tag(NamedTuple):
     """Kind of a line.
 
     dimension : 2 or 3
-    ids : number of vertex ids that it begins with: 1 of a vertex, 2 of an edge
-    columns : which numbers of a whole line follow: a pose (x y θ, or x y z qx qy qz qw), and of an edge the upper
-        triangle of Ω, row by row. TORO has roll, pitch and yaw for the quaternion
+    ids : number of vertex ids that it begins with: 1 for a vertex, 2 for an edge
+    columns : indices of its other numbers in a complete line: a pose (x y θ, or x y z qx qy qz qw), and for an
+        edge the upper triangle of Ω, row by row. TORO has roll, pitch and yaw instead of the quaternion
     is_point : whether it is a point, or an edge to one
     """
 
@@ -61,21 +61,21 @@ TAGS = {
     "VERTEX3": Tag(3, 1, tuple(range(6)), is_toro=True),
     "EDGE3": Tag(3, 2, (*range(6), *range(7, 28)), is_toro=True),
 }
-PRIOR_TAGS = {  # of edges from the origin; in space the vertex is followed by the number of a sensor's offset
+PRIOR_TAGS = {  # of unary edges; in 3D the vertex id is followed by the id of a sensor offset
     "EDGE_PRIOR_SE2": Tag(2, 1, tuple(range(9))),
     "EDGE_PRIOR_SE2_XY": Tag(2, 1, (0, 1, 3, 4, 6)),
     "EDGE_SE3_PRIOR": Tag(3, 2, tuple(range(28))),
 }
 _NO_OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"
-_WIDTHS = {(2, 1): 3, (2, 2): 9, (3, 1): 7, (3, 2): 28}  # numbers of a whole line, by dimension and ids
+_WIDTHS = {(2, 1): 3, (2, 2): 9, (3, 1): 7, (3, 2): 28}  # numbers of a complete line, by dimension and ids
 
 
 def write_lines(
     dimension: int, ids: NDArray[np.int64], numbers: Matrix, is_point: NDArray[np.bool_], *, is_toro: bool
 ) -> list[str]:
-    """Lines of vertices, ids (n, 1), or edges (n, 2), of whole lines as g2o has them (n, m).
+    """Lines of vertices, ids (n, 1), or edges (n, 2), from the numbers (n, m) of complete g2o lines.
 
-    Every number is the shortest that reads back as the same.
+    Every number is written with the fewest digits that read back as the same value.
     """
     if is_toro and dimension == 3:
         numbers = np.hstack([numbers[:, :3], to_angles(numbers[:, 3:7]), numbers[:, 6:]])
@@ -92,7 +92,7 @@ def write_lines(
 
 
 def to_angles(quat_xyzw: Matrix) -> Matrix:
-    """Roll, pitch and yaw (n, 3); exact at a pitch of ±π/2 too, where yaw is free and taken as zero."""
+    """Roll, pitch and yaw (n, 3); exact at a pitch of ±π/2 too, where yaw is arbitrary and set to zero."""
     R = lie.from_quaternion(quat_xyzw)
     yaw = np.where(np.hypot(R[:, 0, 0], R[:, 1, 0]) > 1e-9, np.arctan2(R[:, 1, 0], R[:, 0, 0]), 0.0)
     c, s = np.cos(yaw), np.sin(yaw)
@@ -104,9 +104,9 @@ def to_angles(quat_xyzw: Matrix) -> Matrix:
 class Rows(NamedTuple):
     """Vertices or edges, those of poses before those of points, each in the order of the file.
 
-    lines : (n,) where they stand
+    lines : (n,) line numbers in the file
     ids : (n, 1) or (n, 2) vertex ids
-    numbers : (n, m) whole lines as g2o has them, zero where a tag has no number
+    numbers : (n, m) of complete g2o lines, zero where a tag has no number
     is_point : (n,) bool, points or edges to points
     """
 
@@ -117,14 +117,14 @@ class Rows(NamedTuple):
 
 
 class Lines:
-    """Content of a file; a line that cannot be understood is an error that names it.
+    """Content of a file; an invalid line raises an error with its line number.
 
     dimension : 2 or 3
     vertices, edges, priors : their lines, those of priors with the vertex twice
-    fixed : line and vertex id (n, 2) of every pose that is held
+    fixed : line and vertex id (n, 2) of every fixed pose
     others : lines of other tags
-    note : as of ``G2oFile``
-    rotation : of which the information is, by the comment that ``write_g2o`` writes
+    note : as in ``G2oFile``
+    rotation : rotation parametrization of the information, from the comment that ``write_g2o`` writes
     """
 
     def __init__(self, path: Path) -> None:
@@ -155,20 +155,20 @@ class Lines:
             raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
 
     def error(self, line: object, text: str) -> InputError:
-        """The error that names this line."""
+        """An error with this line number."""
         return InputError(f"{self.path}:{line}: {text}")
 
     def indices(
         self, lines: NDArray[np.int64], names: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Indices (n, w) of vertices by their names among ``ids`` (K,), of lines (n,) that name them."""
+        """Indices (n, w) in ``ids`` (K,) of the vertices that lines (n,) name."""
         order = np.argsort(ids)
         indices = order[np.minimum(np.searchsorted(ids, names, sorter=order), len(ids) - 1)]
         self.check_known(lines, names, ids[indices] == names)
         return indices
 
     def check_known(self, lines: NDArray[np.int64], names: NDArray[np.int64], is_known: NDArray[np.bool_]) -> None:
-        """Refuse lines (n,) that name vertices (n, w) that are not there."""
+        """Raise InputError for lines (n,) that name vertices (n, w) missing in the file."""
         for row, column in np.argwhere(~is_known)[:1]:
             raise self.error(lines[row], f"vertex {names[row, column]} is not in the file; add its VERTEX line")
 
@@ -200,7 +200,7 @@ class Lines:
         """Vertex ids and numbers of a line."""
         name, tag = words[0], (TAGS | PRIOR_TAGS)[words[0]]
         if self.dimension not in (0, tag.dimension):
-            raise self.error(line, f"{name} in an SE({self.dimension}) graph; keep to one dimension a file")
+            raise self.error(line, f"{name} in an SE({self.dimension}) graph; use one dimension per file")
         self.dimension = tag.dimension
         if len(words) != 1 + tag.ids + len(tag.columns):
             count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
@@ -217,7 +217,7 @@ class Lines:
         return ids, numbers
 
     def _check_offset(self, line: int, offset: list[int]) -> None:
-        """Refuse a prior of a sensor that is not at the vertex itself, by the PARAMS lines above."""
+        """Raise InputError for a prior of a sensor that is offset from the vertex, by the PARAMS lines above."""
         for words in map(str.split, self.others):
             is_its = words[:2] == ["PARAMS_SE3OFFSET", *map(str, offset)]
             if is_its and words[2:8] != _NO_OFFSET.split()[2:8] and list(map(float, words[2:8])) != [0.0] * 6:
@@ -229,11 +229,11 @@ class Lines:
         try:
             return int(np.int64(word))
         except (ValueError, OverflowError):
-            text = f"{tag}: vertex id {shown(word)} is no whole number of 64 bits; write 0, 1, 2, ..."
+            text = f"{tag}: vertex id {shown(word)} is not a 64-bit integer; write 0, 1, 2, ..."
             raise self.error(line, text) from None
 
     def _whole(self, rows: list[_Row], ids: int) -> Rows:
-        """Vertices or edges as whole lines."""
+        """Vertices or edges as complete g2o lines."""
         numbers = np.zeros((len(rows), _WIDTHS.get((self.dimension, ids), 0)))
         for tag in {row[1] for row in rows}:
             of_tag = [place for place, row in enumerate(rows) if row[1] is tag]
@@ -260,7 +260,7 @@ Chosen = Literal["in force", "rejected"]
 
 
 def rejected_path(path: Path) -> Path:
-    """The file beside a graph that holds its rejected edges: graph_rejected.g2o beside graph.g2o."""
+    """The file with the rejected edges of a graph, next to its file: graph_rejected.g2o for graph.g2o."""
     return path.with_name(f"{path.stem}_rejected{path.suffix}")
 
 
@@ -274,15 +274,15 @@ def write_g2o(
     rotation: Rotation = "vector",
     force: bool = False,
 ) -> None:
-    """Write poses, points and edges with full information matrices; to .graph or .toro as TORO has them.
+    """Write poses, points and edges with full information matrices; .graph and .toro files in the TORO format.
 
-    ids : (K,) the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name
+    ids : (K,) the vertex ids, by default 0, 1, …; FIX is written for poses that were fixed by ``PoseGraph.fix``
     edges : those "in force" with their robust weight in Ω, so that the poses are the minimum of the file's own χ²
-    rotation : of what Ω is in 3D, which the first line of the file says: "vector" for a rotation vector, as this
-        package, GTSAM and published graphs have it, or "quaternion" for the vector part of the unit quaternion,
-        half as long, as g2o itself has it
-    force : whether a file that is there is replaced; else InputError, as for a graph with points in TORO
-    Warns of edges of factors of one's own, which the format lacks.
+    rotation : rotation parametrization of Ω in 3D, stated in the first line of the file: "vector" for a rotation
+        vector, as in this package, GTSAM and published graphs, or "quaternion" for the vector part of the unit
+        quaternion, half as long, as in g2o itself
+    force : whether to replace an existing file; else InputError, as for a graph with points in TORO
+    Warns of edges of custom factors, which the format lacks.
     """
     checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
     checks.one_of(rotation, get_args(Rotation), "rotation")
@@ -313,12 +313,10 @@ def write_g2o(
 
 
 def _written(path: Path, graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The chosen edges (E,) that the format has."""
+    """The chosen edges (E,) that the format can represent."""
     left_out = chosen & graph.is_custom
     if left_out.any():
-        text = (
-            f"{path}: g2o has no tag for {counted(int(left_out.sum()), 'edge')} of factors of one's own; left out"
-        )
+        text = f"{path}: g2o has no tag for {counted(int(left_out.sum()), 'edge')} of custom factors; left out"
         warnings.warn(text, stacklevel=3)
     return chosen & ~graph.is_custom
 
@@ -348,8 +346,8 @@ Indefinite = Literal["project", "refuse"]
 class Projection:
     """Edges of a file with an indefinite information matrix, and the change by projecting it.
 
-    edges, of : how many edges, of how many
-    median, most : ‖Ω − Ω₊‖ / ‖Ω‖ of these, Frobenius
+    edges, of : number of these edges, and of all edges
+    median, most : median and largest ‖Ω − Ω₊‖ / ‖Ω‖ of these, Frobenius norm
     first : the first of them, by its vertices and its line
     """
 
@@ -374,12 +372,12 @@ class Projection:
 class G2oFile:
     """A pose graph as read.
 
-    graph : the poses in the order of their ids, then the points in that of theirs; the stamp of each is its id
+    graph : the poses, then the points, each in the order of their ids; the stamp of each is its id
     ids : (K,) the file's vertex ids
     other_lines : lines about neither poses nor edges, retained to be written again
-    has_guess : whether the file holds vertices; else the graph's poses follow its odometry
+    has_guess : whether the file holds vertices; else the graph's poses are chained along its odometry
     projection : of the indefinite information matrices; None without any
-    note : that angles may be degrees; empty where none lies beyond a turn
+    note : warning that angles may be in degrees; empty if none exceeds a full turn
     """
 
     __repr__ = brief
@@ -409,10 +407,11 @@ def read_g2o(
 ) -> G2oFile:
     """Read a graph.
 
-    loops : "robust" marks edges between poses that do not follow each other for the robust loss
+    loops : "robust" gives edges between non-consecutive poses the robust loss
     indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
         semidefinite one and warn, or "refuse" the file
-    rotation : of what the information is in 3D, as in ``write_g2o``; as the file says, else "vector"
+    rotation : rotation parametrization of the information in 3D, as in ``write_g2o``; by default the one stated in
+        the file, else "vector"
     """
     path = checks.path(path, "path")
     lines = Lines(path)
@@ -459,7 +458,7 @@ def read_g2o(
 
 
 def _information(rows: Rows, dimension: int, *, is_quaternion: bool) -> Matrix:
-    """Information (n, k, k) that rows of edges end with."""
+    """Information (n, k, k) at the end of rows of edges."""
     k = 3 if dimension == 2 else 6
     information = np.zeros((len(rows.lines), k, k))
     a, b = np.triu_indices(k)
@@ -492,9 +491,9 @@ def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Proje
 
 
 def _vertices(lines: Lines) -> tuple[NDArray[np.int64], NDArray[np.bool_], Matrix]:
-    """Ids (K,), those of poses and then those of points, ascending, which are points, and poses (K, d+1, d+1).
+    """Ids (K,), of poses and then of points, each ascending; is_point (K,); and poses (K, d+1, d+1).
 
-    Without vertex lines those of the edges, at the identity.
+    Without vertex lines the ids are those in the edges, and the poses are the identity.
     """
     vertices, edges = lines.vertices, lines.edges
     if not len(vertices.lines):
@@ -508,7 +507,7 @@ def _vertices(lines: Lines) -> tuple[NDArray[np.int64], NDArray[np.bool_], Matri
         again = order[1:][(ids[1:] == ids[:-1]) & (is_point[1:] == is_point[:-1])]
         for row in np.sort(again)[:1]:
             name = vertices.ids[row, 0]
-            raise lines.error(vertices.lines[row], f"vertex {name} stands in the file twice; remove one")
+            raise lines.error(vertices.lines[row], f"vertex {name} is in the file twice; remove one")
     for name in np.intersect1d(ids[is_point], ids[~is_point])[:1]:
         raise InputError(f"{lines.path}: vertex {name} is a pose and a point; give each an id of its own")
     return ids, is_point, poses

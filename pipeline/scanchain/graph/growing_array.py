@@ -1,4 +1,4 @@
-"""Arrays that grow at their end, with room kept in reserve so that appending costs little on average."""
+"""Arrays that grow at their end, with spare capacity so that appending takes constant time on average."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 
 class GrowingArray:
-    """Rows of one shape and type; the room doubles when it is full."""
+    """Rows of one shape and type; the capacity doubles when it is full."""
 
     def __init__(self, row_shape: tuple[int, ...], dtype: DTypeLike) -> None:
         self._room = np.empty((16, *row_shape), dtype)
@@ -20,7 +20,7 @@ class GrowingArray:
         return self._count
 
     def append(self, row: Any) -> int:
-        """Index of the row, now the last."""
+        """Index of the row, which is appended."""
         if self._count == len(self._room):
             self._make_room(self._count + 1)
         self._room[self._count] = row
@@ -48,13 +48,13 @@ class GrowingArray:
         return view
 
     def replace(self, rows: NDArray[Any]) -> None:
-        """Put these in place of all rows; views handed out before keep the old ones."""
+        """Replace all rows by these; views returned before keep the old ones."""
         self._room = np.array(rows, self._room.dtype)
         self._count = len(rows)
 
 
 class Columns:
-    """Records of one kind in growing columns, texts as numbers: a fraction of the memory of their objects."""
+    """Records of one kind in growing columns, texts as integer codes: a fraction of the memory of objects."""
 
     def __init__(self) -> None:
         self._columns: dict[str, GrowingArray] = {}
@@ -69,7 +69,7 @@ class Columns:
 
     @property
     def texts(self) -> list[str]:
-        """Texts by their numbers."""
+        """Texts by integer code."""
         return list(self._numbers)
 
     def append(self, record: Mapping[str, Any]) -> None:

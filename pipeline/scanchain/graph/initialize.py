@@ -25,8 +25,8 @@ def first_guess(
 ) -> tuple[Matrix, Initialization]:
     """Initial poses, and the method that they come from.
 
-    "auto" keeps the poses at hand where they fit, else takes the better of them and the chordal relaxation. Where
-    there may be outliers it keeps them in any case: no other guess is safe from a false loop.
+    "auto" keeps the given poses where they fit, else uses the better of them and the chordal relaxation. If there
+    may be outliers it always keeps them, since the chordal relaxation is not robust to false loops.
     """
     fixed, to_point = problem.variable < 0, np.asarray(problem.is_point[problem.edges].any(axis=1))
     if initialize in ("odometry", "spanning-tree"):
@@ -54,7 +54,7 @@ def first_guess(
 
 
 def _with_points(problem: GraphProblem, poses: Matrix, to_point: NDArray[np.bool_]) -> Matrix:
-    """Poses with every free point where it is seen from its poses, on average, by these edges (E,)."""
+    """Poses with every free point at the mean of its positions as seen from poses, by these edges (E,)."""
     i, j = problem.edges[to_point].T
     total = np.zeros(poses.shape)
     np.add.at(total, j, poses[i] @ problem.measurements[to_point])
@@ -65,7 +65,7 @@ def _with_points(problem: GraphProblem, poses: Matrix, to_point: NDArray[np.bool
 
 
 def follow_odometry(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
-    """Poses chained along the edges between successive poses, and where one is missing, the next shortest leap."""
+    """Poses chained along edges between successive poses or, where one is missing, the next closest indices."""
     pairs, first = _distinct_pairs(edges, len(poses))
     low, high = np.divmod(pairs, len(poses))
     tree = minimum_spanning_tree(csr_matrix((high - low, (low, high)), shape=(len(poses), len(poses)))).tocoo()
@@ -76,7 +76,7 @@ def follow_odometry(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.i
 def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
     """Poses (K, d+1, d+1) chained from the fixed ones along the fewest edges; unreachable ones stay."""
     count, fixed_poses = len(poses), np.flatnonzero(fixed)
-    from_root = np.stack([np.full(len(fixed_poses), count), fixed_poses])  # one root more, beside every fixed pose
+    from_root = np.stack([np.full(len(fixed_poses), count), fixed_poses])  # an extra root with all fixed poses
     ends = np.concatenate([edges.T, from_root], axis=1)
     links = csr_matrix((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(count + 1, count + 1))
     _, parent = breadth_first_order(links, count, directed=False)
@@ -87,18 +87,18 @@ def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray
     is_forward = (edges[edge, 1] == child)[:, None, None]
     motion = np.tile(lie.identity(poses.shape[-1] - 1), (count, 1, 1))
     motion[child] = np.where(is_forward, Z[edge], lie.inverse(Z[edge]))
-    while (parent[parent] != parent).any():  # each round, every motion begins twice as far back
+    while (parent[parent] != parent).any():  # each round doubles the edges that a motion spans
         motion, parent = motion[parent] @ motion, parent[parent]
     return poses[parent] @ motion
 
 
 def _distinct_pairs(edges: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of every pair of poses that edges (E, 2) join, ascending, and the first edge of each."""
+    """Integer key of every pair of poses that edges (E, 2) join, ascending, and the first edge of each."""
     return np.unique(_pairs(edges[:, 0], edges[:, 1], count), return_index=True)
 
 
 def _pairs(i: NDArray[np.int64], j: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Number of each unordered pair of poses, of so many."""
+    """Integer key of each unordered pair of ``count`` poses."""
     return np.minimum(i, j) * count + np.maximum(i, j)
 
 
@@ -107,7 +107,7 @@ def relax_chordally(problem: GraphProblem, poses: Matrix) -> Matrix:
 
     Rotations: minimize Σ κ ‖R_j − R_i R_z‖² over any matrices, then take the nearest rotation of each.
     Translations: minimize Σ τ ‖t_j − t_i − R_i t_z‖². κ and τ are the mean rotational and translational
-    information of the edge, none of factors of one's own. The problem's fixed poses stay where ``poses`` has them.
+    information of the edge, zero for custom factors. The problem's fixed poses keep their values in ``poses``.
     """
     d = poses.shape[-1] - 1
     Z, information = problem.measurements, problem.is_bounded[:, None, None] * problem.information
@@ -130,7 +130,7 @@ def _least_squares(
 ) -> Matrix:
     """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed.
 
-    Points, which have no rotation, have a unit prior on that.
+    Points, which have no rotation, get a unit prior on it.
     """
     size, columns = known.shape[1:]
     n, w = len(problem.free), weight[:, None, None]

@@ -1,4 +1,4 @@
-"""Robust losses of loop edges, and their graduation."""
+"""Robust losses of loop edges, and their schedules of graduated non-convexity (GNC)."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from scanchain.errors import InputError, one_line
 Array = NDArray[np.float64]
 
 _TRUE_SHARE = 0.999  # share of true loops whose χ² stays below the limit, if the noise model is right
-_SHARP = 1e4  # control above which truncated least squares is as good as its limit
-_FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is all but convex; its step there
-_ONE, _SLOPE = 0.99, 1e-3  # least weight at χ² = 0, and largest error of the slope, of a class of the user's
-_FACTOR = 1.4  # step of the graduation (Yang et al. 2020, remark 5)
-_MARGIN = 6.0  # factor over the share of a pessimistic noise model: residuals have long tails
+_SHARP = 1e4  # control above which truncated least squares is replaced by its limit
+_FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is almost convex; its factor there
+_ONE, _SLOPE = 0.99, 1e-3  # least weight at χ² = 0, and largest error of the slope, of a user-defined class
+_FACTOR = 1.4  # ratio of successive controls (Yang et al. 2020, remark 5)
+_MARGIN = 6.0  # safety factor on the price under a pessimistic noise model: residuals have long tails
 _FEWEST = 10  # least number of inlier edges from which a noise model is estimated
 
 
 class Kernel(Protocol):
-    """A loss by its functions of χ² (N,), the scale s, and the control μ of its graduation.
+    """A robust loss as functions of χ² (N,), the scale s, and the control μ of its GNC schedule.
 
-    One that is not convex may have a method ``schedule(ratio)``: the controls of graduated non-convexity (Yang et
-    al. 2020, remark 5), from the convex end, by the ratio 2 χ²/s² of the largest residual, to that of the loss
-    itself. Without it, it is minimized as it is, with μ = 1.
+    A non-convex loss may have a method ``schedule(ratio)`` with the controls of graduated non-convexity (Yang et
+    al. 2020, remark 5), from a convex loss to the loss itself; the ratio is 2 χ²/s² of the largest residual.
+    Without this method the loss is minimized directly, with μ = 1.
     """
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """Weight w = dρ/dχ² in [0, 1], 1 near zero whatever the scale."""
+        """Weight w = dρ/dχ² in [0, 1], 1 near zero for any scale."""
         ...
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -88,7 +88,7 @@ class Huber:
 
 
 class Cauchy:
-    """Of the Cauchy distribution: grows without bound, but slowly."""
+    """Loss of the Cauchy distribution: grows without bound, but slowly."""
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
         """Weight w = s² / (s² + χ²)."""
@@ -151,11 +151,11 @@ class Truncated:
 
 @dataclass(frozen=True, slots=True)
 class RobustLoss:
-    """ρ(χ²) with weight w = dρ/dχ², so that w = 1 near zero whatever the scale.
+    """ρ(χ²) with weight w = dρ/dχ², so that w = 1 near zero for any scale.
 
-    kernel : which of ``LOSSES``, or module:Class
-    scale : s, the χ (a pure number) at which a residual starts to count less
-    control : μ of the graduation; 1, or ∞ for truncated least squares, is the loss itself
+    kernel : name in ``LOSSES``, or module:Class
+    scale : s, the χ (a pure number) at which a residual starts to be downweighted
+    control : μ of the GNC schedule; 1, or ∞ for truncated least squares, is the loss itself
     """
 
     kernel: str
@@ -171,7 +171,7 @@ class RobustLoss:
         return _kernel(self.kernel).loss(chi2, self.scale, self.control)
 
     def graduated(self, chi2: Array) -> Iterator[RobustLoss]:
-        """From the convex end of its graduation, for residuals that begin at these χ², to itself."""
+        """Losses of its GNC schedule, from a convex one, for residuals that begin at these χ², to itself."""
         schedule = getattr(_kernel(self.kernel), "schedule", None)
         ratio = 2.0 * float(chi2.max(initial=0.0)) / self.scale**2
         for control in schedule(ratio) if schedule else (self.control,):
@@ -179,14 +179,14 @@ class RobustLoss:
 
 
 def rejection_limit(scale: float, degrees: int) -> float:
-    """χ² above which a loop edge counts as false: its kernel's scale², but no true loop in a thousand."""
+    """χ² above which a loop edge is an outlier: the kernel's scale², at least the 99.9 % quantile of inliers."""
     return max(scale**2, 2.0 * float(gammaincinv(0.5 * degrees, _TRUE_SHARE)))
 
 
 def robust_loss(kernel: str, scale: float, degrees: int) -> RobustLoss:
-    """The loss by its name; truncated least squares cuts where the verdict falls.
+    """The loss of this name; truncated least squares truncates at ``rejection_limit``.
 
-    Raises InputError where a class of the user's cannot be had or is no loss.
+    Raises InputError if a user-defined class cannot be loaded or is not a loss.
     """
     if kernel == "truncated":
         return RobustLoss(kernel, np.sqrt(rejection_limit(scale, degrees)), np.inf)
@@ -202,7 +202,7 @@ def _kernel(name: str) -> Kernel:
 
 
 def _check(loss: RobustLoss) -> None:
-    """Raises InputError where a class of the user's gives no weights in [0, 1], or a loss with another slope."""
+    """Raise InputError if a user-defined class has weights outside [0, 1], or a loss with another slope."""
     chi2 = loss.scale**2 * np.array([0.0, 1e-3, 0.3, 0.9, 3.0, 100.0])
     step = 1e-6 * loss.scale**2
     try:
@@ -210,7 +210,7 @@ def _check(loss: RobustLoss) -> None:
         slope = (np.asarray(loss.loss(chi2 + step), np.float64) - loss.loss(chi2)) / step
     except InputError:
         raise
-    except Exception as error:  # of the user's own code
+    except Exception as error:  # of user-defined code
         reason = one_line(error)
         raise InputError(
             f"{loss.kernel}: fails for χ² (N,) ({type(error).__name__}: {reason}); wanted weight(self, chi2, s, "
@@ -224,10 +224,10 @@ def _check(loss: RobustLoss) -> None:
 
 @dataclass(frozen=True, slots=True)
 class InlierSet:
-    """Loop edges kept or not, as a loss: a kept edge costs its χ², another its price.
+    """Inlier set of the loop edges as a loss: an inlier costs its χ², an outlier the price.
 
-    kept : (L,) bool, of the loop edges
-    price : what leaving an edge out costs, in χ²
+    kept : (L,) bool, inliers among the loop edges
+    price : cost of rejecting an edge, in χ²
     """
 
     kept: NDArray[np.bool_]
@@ -244,10 +244,10 @@ class InlierSet:
 
 
 def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> float:
-    """The price, lowered where the contradictions of kept edges (L,) show that the noise model is pessimistic.
+    """The price, lowered if the distances ``against`` (L,) of kept edges show that the noise model is pessimistic.
 
-    Information matrices that are far too small would let in any edge. The median of the contradictions, against
-    that of χ² with so many degrees of freedom, is the factor.
+    With information matrices that are far too small any edge would be accepted. The factor is the median of the
+    distances over that of χ² with this many degrees of freedom, with a margin.
     """
     if len(against) < _FEWEST:
         return nominal

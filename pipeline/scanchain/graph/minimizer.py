@@ -22,7 +22,7 @@ Loss = RobustLoss | InlierSet
 
 
 class Limits(NamedTuple):
-    """End of a descent: largest number of iterations, and relative change of the cost, gradient or step."""
+    """Stopping criteria of a descent: number of iterations, and relative change of the cost, gradient or step."""
 
     max_iterations: int
     tolerance: float
@@ -30,7 +30,7 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Poses with what follows from them: residuals e, χ² of every edge, and the robust cost Σ ρ(χ²)."""
+    """Poses, and the residuals e, χ² of every edge and robust cost Σ ρ(χ²) at them."""
 
     poses: Matrix
     errors: Matrix
@@ -40,9 +40,9 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """End of a minimization: poses, robust weights (E,), number of linear solves, reason, and where it began.
+    """Result of a minimization: poses, robust weights (E,), number of linear solves, why it ended, initialization.
 
-    ``price`` is what leaving a loop edge out cost, in χ²; 0 where the set of inliers was not refined.
+    ``price`` is the cost of rejecting a loop edge, in χ²; 0 where the inlier set was not refined.
     """
 
     estimate: Evaluation
@@ -55,7 +55,7 @@ class Minimum:
 
 
 class Minimizer:
-    """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of robust ones, with one step rule throughout."""
+    """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of robust ones, always with the same step rule."""
 
     def __init__(self, problem: GraphProblem, optimizer: Optimizer, limits: Limits) -> None:
         self.problem, self.limits = problem, limits
@@ -70,11 +70,11 @@ class Minimizer:
         return Evaluation(poses, errors, chi2, self._cost(chi2, loss))
 
     def reweighed(self, now: Evaluation, loss: Loss) -> Evaluation:
-        """The same poses at the cost of another loss."""
+        """The same poses with the cost under another loss."""
         return Evaluation(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
 
     def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
-        """The same with a subset of the edges, kept (E,)."""
+        """The same minimizer for a subset of the edges, kept (E,)."""
         return Minimizer(self.problem.restricted(kept), self.optimizer, self.limits)
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
@@ -84,7 +84,7 @@ class Minimizer:
         return result
 
     def descend(self, now: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
-        """Iterate until convergence, by default within the limits of all descents."""
+        """Iterate until convergence, by default within ``self.limits``."""
 
         def moved(start: Evaluation, step: Vector) -> Evaluation:
             return self.evaluate(self.problem.moved(start.poses, step), loss)
@@ -119,9 +119,9 @@ Vector = NDArray[np.float64]
 
 _MOST_DAMPING = 1e12
 _LEAST_DAMPING = 1e-15
-_FIRST_DAMPING = 1e-12  # first damping, all but Gauss-Newton: weak modes of a long chain have 1e-9 of diag H
-_GROWTH = 8.0  # of the damping after a step that fails, four times as fast after each further one
-_SHORTEST = 1e-12  # share of the best length at which no step is worth trying
+_FIRST_DAMPING = 1e-12  # initial damping, almost Gauss-Newton: weak modes of a long chain have 1e-9 of diag H
+_GROWTH = 8.0  # factor on the damping after a failed step; it quadruples with each further failure
+_SHORTEST = 1e-12  # share of the model's best step length below which no step is tried
 
 
 class Estimate(Protocol):
@@ -155,9 +155,10 @@ class GaussNewton:
     """x ← x − H⁻¹ g, whether or not the cost falls."""
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
-        """A step (n,) and the estimate after it, or None where no step lowers the cost, as in the other rules.
+        """A step (n,) and the estimate after it; None if its cost is not finite.
 
-        Raises SingularMatrixError where the equations leave something free.
+        The other rules return None if no step lowers the cost. Raises SingularMatrixError where the equations do
+        not determine all unknowns.
         """
         step = model.solve(0.0)
         to = moved(step)
@@ -171,7 +172,7 @@ class Damped:
         self._first, self._damping, self._growth = first_damping, first_damping, _GROWTH
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
-        """Damp more until the cost falls."""
+        """A step and the estimate after it, with the damping increased until the cost falls."""
         while self._damping < _MOST_DAMPING:
             with suppress(SingularMatrixError):
                 step = model.solve(self._damping)
@@ -189,10 +190,10 @@ class Damped:
 
 
 class GradientDescent:
-    """Steepest descent in the measure of D = diag H, to the lowest point of the model, halved until it helps."""
+    """Steepest descent in the metric D = diag H, to the minimum of the model, halved until the cost falls."""
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
-        """Go down the gradient."""
+        """A step along the negative gradient and the estimate after it."""
         direction, share = -model.gradient / np.maximum(model.diagonal, 1e-300), 1.0
         bent = float(direction @ model.bend(direction))
         step = direction * (-float(direction @ model.gradient) / max(bent, 1e-300))
@@ -208,7 +209,7 @@ StepRule = GaussNewton | Damped | GradientDescent
 
 
 def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
-    """The rule by its name."""
+    """Step rule of this name."""
     if optimizer == "levenberg-marquardt":
         return Damped(first_damping)
     return GaussNewton() if optimizer == "gauss-newton" else GradientDescent()
@@ -216,7 +217,7 @@ def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> St
 
 @dataclass(frozen=True, slots=True)
 class Descent(Generic[E]):
-    """End of a minimization: estimate, number of steps and reason."""
+    """Result of a descent: estimate, number of steps and why it ended."""
 
     estimate: E
     iterations: int
@@ -232,9 +233,9 @@ def descend(
     max_iterations: int,
     tolerance: float,
 ) -> Descent[E]:
-    """Go downhill; done where the relative change of χ², every entry of the gradient or the step is that small.
+    """Descend until the relative change of χ², every entry of the gradient, or the step is below the tolerance.
 
-    Entries of the gradient count in units of their own curvature; the largest counts as 1 where all are below.
+    Each entry of the gradient is divided by √(diag H), and also by √(max diag H) where that is below 1.
 
     model_at : quadratic model of the cost at an estimate
     moved : the estimate after a step (n,)

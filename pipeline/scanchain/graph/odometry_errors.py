@@ -1,4 +1,4 @@
-"""Errors of odometry that loop edges show: constant drift, and segments of inflated covariance."""
+"""Odometry errors inferred from loop edges: constant drift, and segments of inflated covariance."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from scanchain.data import Matrix
 
 Vector = NDArray[np.float64]
 
-FEWEST = 3  # least number of loop edges left out, none near another, that a drift or a jump must explain
-_SCALE_SIGMA, _TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations, of the scale and of the turn a meter
+FEWEST = 3  # least number of rejected loop edges, none near another, that a drift or a jump must explain
+_SCALE_SIGMA, _TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations of the scale and of the turn per meter
 _SLIP_SIGMA_M, _JUMP_SIGMAS = 1.0, (1.0, 0.2)  # standard deviations, m or (m, rad)
-_SLIP_PROBABILITY, _JUMP_PROBABILITY = 1e-3, 1e-4  # of one that begins at an edge
-_WEAKER = 2.0  # factor between the least and the largest information of a translation from which on one is weak
+_SLIP_PROBABILITY, _JUMP_PROBABILITY = 1e-3, 1e-4  # that one begins at an edge
+_WEAKER = 2.0  # ratio of the largest to the least information on a translation at which one direction is weak
 _MOVES = 3.0  # least length of a motion that may slip, in its standard deviations
 
 
 @dataclass(frozen=True, slots=True)
 class Loosened:
-    """So many odometry edges from the first on, in the order of the poses, that are off by more than they say.
+    """A segment of ``count`` odometry edges, in the order of the poses, whose errors exceed their covariance.
 
-    In a slip they are off together, each along its weakest direction; in a jump one edge is wrong altogether.
+    In a slip the edges share an error, each along its weakest direction; in a jump one edge is entirely wrong.
     """
 
     first: int
@@ -33,20 +33,21 @@ class Loosened:
 
     @property
     def edges(self) -> slice:
-        """Its edges among those of odometry."""
+        """Its edges among those of odometry, in the order of the poses."""
         return slice(self.first, self.first + self.count)
 
     def spread(self, measured: Matrix, information: Matrix) -> Matrix:
-        """Twists (count, k, p) of its edges by a standard deviation of each of its p errors; of all odometry."""
+        """Twists (count, k, p) of its edges by one standard deviation of each of p errors, from all odometry."""
         return spread(measured[self.edges], information[self.edges], is_jump=self.is_jump) / self.count
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Errors of odometry.
+    """Odometry errors that explain rejected loop edges.
 
-    drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
-    loosened : slips and jumps, segments of odometry that are off by more than their edges say
+    drift : (2,) or (4,) share of the path by which odometry is too short, and radians per meter that it turns too
+        little
+    loosened : slips and jumps, segments of odometry with inflated covariance
     """
 
     drift: Vector
@@ -54,24 +55,24 @@ class Explanation:
 
     @classmethod
     def none(cls, freedom: int) -> Explanation:
-        """Odometry as it is."""
+        """No errors: odometry as measured."""
         return cls(np.zeros(2 if freedom == 3 else 4))
 
     def applied(
         self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_odometry: NDArray[np.bool_]
     ) -> tuple[Matrix, Matrix]:
-        """Measurements (E, d+1, d+1) without drift, and their information (E, k, k), slips and jumps loosened.
+        """Measurements (E, d+1, d+1) without drift, and their information (E, k, k), reduced in slips and jumps.
 
-        The noise of a motion that is made longer is longer by the same share: with the noise left as it was, one
-        made shorter would fit better for its shorter noise alone.
+        The noise of a motion scales with its corrected length: with unscaled noise, a shortened motion would fit
+        better merely because its noise is shortened as well.
         """
         if not self.drift.any() and not self.loosened:
             return measured, information
         odometry = odometry_of(edges, is_odometry)
         of_odometry, Z = information[odometry], measured[odometry]
-        for stretch in self.loosened:
-            twists = stretch.spread(Z, information[odometry])
-            of_odometry[stretch.edges] = _loosened(of_odometry[stretch.edges], twists)
+        for segment in self.loosened:
+            twists = segment.spread(Z, information[odometry])
+            of_odometry[segment.edges] = _inflated(of_odometry[segment.edges], twists)
         if self.drift[0]:
             scale = lie.by_component(information.shape[-1], 1.0 / (1.0 + self.drift[0]), 1.0)
             of_odometry = of_odometry * np.outer(scale, scale)
@@ -81,29 +82,29 @@ class Explanation:
         return measured, information
 
     def with_later(self, other: Explanation, before: int) -> Explanation:
-        """The same with slips and jumps of another, of the edges of odometry that come after so many."""
-        later = (replace(stretch, first=stretch.first + before) for stretch in other.loosened)
+        """The same plus the slips and jumps of another, whose odometry edges follow the first ``before`` ones."""
+        later = (replace(segment, first=segment.first + before) for segment in other.loosened)
         return replace(self, loosened=(*self.loosened, *later))
 
     def cost(self, measured: Matrix, information: Matrix, price: float, nominal: float) -> float:
-        """Cost of the explanation itself, where a loop edge left out costs this price; the arrays of odometry.
+        """Cost of the explanation itself, where a rejected loop edge costs this price; the arrays are of odometry.
 
-        nominal : price where the noise model is right
+        nominal : price if the noise model is right
         """
         result = float((self.drift**2 * prior(len(self.drift))).sum())
         result += FEWEST * price if self.drift.any() else 0.0
-        for stretch in self.loosened:
-            B = stretch.spread(measured, information)
-            claimed = (np.swapaxes(B, 1, 2) @ information[stretch.edges] @ B).sum(axis=0)
-            result += float(cost_of(claimed, is_jump=stretch.is_jump, price=price, nominal=nominal))
+        for segment in self.loosened:
+            B = segment.spread(measured, information)
+            claimed = (np.swapaxes(B, 1, 2) @ information[segment.edges] @ B).sum(axis=0)
+            result += float(cost_of(claimed, is_jump=segment.is_jump, price=price, nominal=nominal))
         return result
 
     def lines(
         self, ends: NDArray[np.int64], noun: str, errors: Matrix, measured: Matrix, information: Matrix
     ) -> list[str]:
-        """The corrections in words, a line each.
+        """The corrections as text, one line each.
 
-        ends (O, 2), noun : numbers for the reader of the poses that odometry joins, and what they number
+        ends (O, 2), noun : displayed numbers of the poses that odometry joins, and the noun for them, as "scans"
         errors (O, k), measured, information : of odometry, in the order of the poses
         """
         found = []
@@ -111,11 +112,11 @@ class Explanation:
             scale, *turns = self.drift.tolist()
             turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
             found.append(f"length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
-        for stretch in sorted(self.loosened, key=lambda each: each.is_jump):
-            along = stretch.spread(measured, information)[..., 0] * (stretch.count / _SLIP_SIGMA_M)
-            size_m = float((along * errors[stretch.edges]).sum())
-            what = "a jump" if stretch.is_jump else f"a slip of {size_m:+.1f} m"
-            poses = ends[stretch.edges]
+        for segment in sorted(self.loosened, key=lambda each: each.is_jump):
+            along = segment.spread(measured, information)[..., 0] * (segment.count / _SLIP_SIGMA_M)
+            size_m = float((along * errors[segment.edges]).sum())
+            what = "a jump" if segment.is_jump else f"a slip of {size_m:+.1f} m"
+            poses = ends[segment.edges]
             found.append(f"{what} between {noun} {poses.min():,} and {poses.max():,}")
         return [f"corrected by loop closures: {what}" for what in found]
 
@@ -127,35 +128,36 @@ def odometry_of(edges: NDArray[np.int64], is_odometry: NDArray[np.bool_]) -> NDA
 
 
 def direction(edges: NDArray[np.int64]) -> Vector:
-    """1 of edges (O, 2) to a later pose, −1 of those to an earlier one."""
+    """1 for edges (O, 2) to a later pose, −1 for those to an earlier one."""
     return np.sign(edges[:, 1] - edges[:, 0]).astype(np.float64)
 
 
 def corrected(measurements: Matrix, drift: Vector, sign: Vector | float = 1.0) -> Matrix:
-    """Motions (E, d+1, d+1) made longer by a share of themselves, drift[0], and turned by drift[1:] a meter.
+    """Motions (E, d+1, d+1) lengthened by the share drift[0] and turned by drift[1:] per meter.
 
-    sign : (E,) −1 of a motion that is measured backward
+    sign : (E,) −1 for a motion that is measured backward
     """
     return lie.exp(changed(lie.log(measurements), drift, sign)) if drift.any() else measurements
 
 
 def changed(twists: Matrix, drift: Vector, sign: Vector | float) -> Matrix:
-    """The same of twists (E, k)."""
+    """The same for twists (E, k)."""
     d = twists.shape[-1] - len(drift) + 1
     length_m = np.linalg.norm(twists[..., :d], axis=-1, keepdims=True) * np.asarray(sign)[..., None]
     return np.concatenate([(1.0 + drift[0]) * twists[..., :d], twists[..., d:] + length_m * drift[1:]], axis=-1)
 
 
 def prior(count: int) -> Vector:
-    """Information of a drift of so many entries."""
+    """Prior information (count,) of a drift."""
     return np.array([_SCALE_SIGMA] + (count - 1) * [_TURN_SIGMA_RAD_M]) ** -2.0
 
 
 def spread(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
-    """Twists (E, k, p) of edges by a standard deviation of each of p errors, all of it on that edge.
+    """Twists (E, k, p) of edges by one standard deviation of each of p errors, all of it on that edge.
 
-    A slip is along the weakest translation, or along the motion where none is weak; zero where the motion is no
-    longer than its noise: its direction is then that of the noise, which a slip would seem to explain.
+    A slip is along the weakest direction of translation, or along the motion where none is weak. It is zero where
+    the motion is not clearly longer than its noise: its direction is then that of the noise, which a slip would
+    appear to explain.
     """
     count, k = information.shape[:2]
     if is_jump:
@@ -173,11 +175,11 @@ def spread(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
     return result
 
 
-def _loosened(information: Matrix, twists: Matrix) -> Matrix:
-    """Information (n, k, k) of the edges of a segment with its errors added to theirs, (Ω⁻¹ + n BBᵀ)⁻¹.
+def _inflated(information: Matrix, twists: Matrix) -> Matrix:
+    """Information (n, k, k) of the edges of a segment with its errors added to their covariance, (Ω⁻¹ + n BBᵀ)⁻¹.
 
-    twists : (n, k, p) B; n times its covariance on each edge make that of the whole segment, as errors that are
-        independent. By Woodbury's identity, Ω may be singular.
+    twists : (n, k, p) B; as independent errors, n BBᵀ on each of the n edges add up to the covariance of the whole
+        segment. With Woodbury's identity, Ω may be singular.
     """
     pull = np.sqrt(len(twists)) * information @ twists
     inner = np.eye(twists.shape[2]) + np.sqrt(len(twists)) * np.swapaxes(twists, 1, 2) @ pull
@@ -185,13 +187,13 @@ def _loosened(information: Matrix, twists: Matrix) -> Matrix:
 
 
 def cost_of(claimed: Matrix, *, is_jump: bool, price: float, nominal: float) -> Vector:
-    """Cost of segments in χ², −2 log of the likelihood over that of none: 2 log(1/p) + log |1 + Σ BᵀΩB|.
+    """Cost of segments in χ², −2 log of the likelihood ratio to none: 2 log(1/p) + log |1 + Σ BᵀΩB|.
 
-    The better the edges are measured, the less likely an error was missed. A jump also costs three loop edges left
-    out, and its likelihood is scaled as their price is.
+    The more accurate the edges, the less likely it is that they missed an error. A jump also costs three rejected
+    loop edges, and its likelihood term is scaled with their price.
 
-    claimed : (..., p, p) Σ BᵀΩB, what the edges say of the errors, in their standard deviations
-    price, nominal : of a loop edge left out, and what it is where the noise model is right
+    claimed : (..., p, p) Σ BᵀΩB, information of the edges on the errors, in standard deviations of these
+    price, nominal : price of a rejected loop edge, and its value if the noise model is right
     """
     log_ratio = np.linalg.slogdet(np.eye(claimed.shape[-1]) + claimed)[1]
     if not is_jump:

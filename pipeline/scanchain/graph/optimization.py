@@ -1,4 +1,4 @@
-"""Optimization of a pose graph by graduated non-convexity, all loop edges judged or only new ones; its result."""
+"""Optimization of a pose graph by graduated non-convexity that judges all loop edges or new ones; its result."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, brief, fit_text
 from scanchain.errors import counted
 from scanchain.graph.consistency import Consistency, agreeing_groups
 from scanchain.graph.edge_checks import has_loop, is_connected
+from scanchain.graph.factors import ORIGIN
 from scanchain.graph.initialize import Initialization, first_guess
 from scanchain.graph.losses import InlierSet, RobustLoss, fair_price, rejection_limit, robust_loss
 from scanchain.graph.minimizer import Evaluation, Limits, Loss, Minimizer, Minimum
@@ -20,18 +21,18 @@ from scanchain.graph.problem import GraphProblem
 
 Rejection = Literal["update", "judge"]
 
-_WASTE = 0.1  # share of edges without weight that is worth a new analysis
-_CRISP = 1e-6  # distance of a weight from 0 or 1 up to which it is that
+_WASTE = 0.1  # share of edges of zero weight above which a new symbolic analysis pays off
+_CRISP = 1e-6  # distance of a weight from 0 or 1 up to which it counts as 0 or 1
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success
-_FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
-# a few steps with one set of edges, until the poses have settled roughly; the next update goes on
+_FEWER, _FEWEST = 0.3, 1e-3  # factor on the share of changes tried after a round without success; least share
+# a few steps per inlier set, until the poses have roughly settled; the next update continues
 _LIMITS = Limits(max_iterations=3, tolerance=1e-3)
 
 
 @dataclass(frozen=True, slots=True)
 class Since:
-    """Number of edges at the last graduation, which judged all of them, and at the last update."""
+    """Number of edges at the last GNC run, which judged all of them, and at the last update."""
 
     judged: int
     updated: int
@@ -39,7 +40,7 @@ class Since:
 
 @dataclass(frozen=True, slots=True)
 class GraphChange:
-    """A graph before and after, for pictures and recordings, each with the edges that were in force then."""
+    """A graph before and after a change, for plots and recordings, each with the edges then in force."""
 
     name: str
     before: GraphState
@@ -54,16 +55,17 @@ def fit(state: GraphState) -> str:
 
 
 def has_loops(state: GraphState) -> bool:
-    """True if an edge in force joins poses that the others join already."""
-    return has_loop(state.edges[~state.is_rejected], len(state.poses))
+    """True if an edge in force joins poses that the others already connect."""
+    count, edges = len(state.poses), state.edges[~state.is_rejected]
+    return has_loop(np.where(edges == ORIGIN, count, edges), count + 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Optimization:
     """Result of ``PoseGraph.optimize``.
 
-    state : the graph as it is now
-    chi2_before, chi2_after : Σ w eᵀΩe over the edges in force before and after, at the poses of then
+    state : the graph after the optimization
+    chi2_before, chi2_after : Σ w eᵀΩe over the edges in force before and after, each at the poses of that time
     cost_after : what was minimized: Σ eᵀΩe of all edges, with the robust loss of the loop edges
     iterations : linear solves
     converged, reason : whether and why the iteration stopped
@@ -97,15 +99,15 @@ def solve(
     *,
     groups: bool = True,
 ) -> Minimum:
-    """Minimize from the chosen guess; fixed poses stay to the bit.
+    """Minimum from the chosen initialization; fixed poses stay the same bit for bit.
 
     since : for an update, under the truncated loss; groups : otherwise, as for ``minimize``
-    Raises SingularMatrixError where the edges leave a pose free, and the optimizer minds.
+    Raises SingularMatrixError if the edges leave a pose free and the optimizer or initialization fails on that.
     """
     outlier_free = config.robust == "none" or not problem.is_robust.any()
     guess, source = first_guess(problem, poses, initialize, outlier_free=outlier_free)
     joined = np.unique(problem.edges) if len(problem.edges) else slice(None)
-    shift = guess[joined, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
+    shift = guess[joined, :-1, -1].mean(axis=0)  # left twists rotate about the origin: move it to the centroid
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
     if since is not None:
@@ -121,7 +123,7 @@ def solve(
 
 
 def _orthonormal(poses: Matrix) -> Matrix:
-    """Poses whose nearly orthonormal rotations are made so again, R (3 I − RᵀR) / 2, one Newton step."""
+    """Poses with their rotations orthonormalized by one Newton step, R (3 I − RᵀR) / 2."""
     result, d = poses.copy(), poses.shape[-1] - 1
     R = poses[:, :d, :d]
     result[:, :d, :d] = R @ (1.5 * np.eye(d) - 0.5 * np.swapaxes(R, 1, 2) @ R)
@@ -129,9 +131,10 @@ def _orthonormal(poses: Matrix) -> Matrix:
 
 
 def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: bool) -> Minimum:
-    """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
+    """Minimum from these poses; a non-convex kernel is graduated first (Yang et al. 2020).
 
-    Truncated edges are judged by how much each contradicts the others, with ``groups`` also by groups that agree.
+    Under the truncated loss each edge is judged by its consistency with the others, with ``groups`` also each
+    group of agreeing edges.
     """
     now, used = minimizer.evaluate(poses, loss), 0
     if len(minimizer.robust):
@@ -146,9 +149,9 @@ def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: b
 
 
 def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[Evaluation, RobustLoss, int]:
-    """Follow the minimum from the convex loss to the loss itself, one step for each between.
+    """Track the minimum from the convex loss to the loss itself, with one step for each loss in between.
 
-    A loss that sharpens is as good as itself once its weights are all 0 or 1.
+    A loss whose control tends to infinity ends its schedule once all weights are 0 or 1.
     """
     used, focus, final = 0, Focus(minimizer), loss
     for loss in final.graduated(now.chi2[minimizer.robust]):
@@ -162,9 +165,10 @@ def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[
 
 
 def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: RobustLoss) -> Minimum:
-    """The minimum without the edges that this one shows to be false, whose weight becomes 0.
+    """The minimum without the edges that this one shows to be outliers, whose weight becomes 0.
 
-    A loss that does not cut edges off leaves them some weight. They keep it where poses would be loose without.
+    A loss that does not truncate leaves outliers some weight. They keep it if poses would be disconnected without
+    them.
     """
     problem, limit = minimizer.problem, rejection_limit(loss.scale, minimizer.problem.freedom)
     rejected = problem.is_robust & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
@@ -183,7 +187,7 @@ def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: Robus
 
 
 class Focus:
-    """Leaves out edges of weight zero, which fill in the factor for nothing: soon most of the wrong ones."""
+    """Descent without the edges of zero weight, soon most of the outliers, which would only cause fill-in."""
 
     def __init__(self, minimizer: Minimizer) -> None:
         self._whole = self._chosen = minimizer
@@ -192,7 +196,7 @@ class Focus:
         self._is_free = is_connected(problem.edges[~problem.is_robust], problem.variable < 0)
 
     def descend(self, start: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
-        """The minimum near these poses, by the edges that have weight there and hardly any other."""
+        """The minimum near these poses, by the edges that have weight there and few others."""
         whole = self._whole
         wanted = whole.weights(start.chi2, loss) > 0.0
         wasted = 1.0 - wanted.sum() / self._kept.sum()
@@ -207,7 +211,7 @@ class Focus:
 
 
 def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: bool) -> Minimum:
-    """The minimum with the present inliers, and then with those that the other edges do not contradict."""
+    """The minimum with the present inliers, then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.robust]) > 0.5, loss.scale**2
     minimum = Focus(minimizer).descend(now, InlierSet(kept, nominal))
     problem = minimizer.problem
@@ -223,7 +227,10 @@ def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: 
 
 
 def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.float64], price: float) -> Minimum:
-    """The minimum after rounds of changes of single edges, as long as the cost falls; ``against`` (L,) them."""
+    """The minimum after rounds that accept or reject single edges, as long as the cost falls.
+
+    against : (L,) as of ``_against``
+    """
     kept, share = minimum.weights[minimizer.robust] > 0.5, 1.0
     for _ in range(_MAX_ROUNDS):
         gain = np.where(kept, against - price, price - against)
@@ -241,10 +248,10 @@ def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.fl
 
 
 def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: float) -> Minimum:
-    """The minimum after changes of groups of edges that agree, each followed by those of single ones.
+    """The minimum after accepting or rejecting groups of agreeing edges, each followed by changes of single edges.
 
-    Wrong edges that agree shield each other: without any one of them, the others predict it. So do the true ones
-    that they push out.
+    Wrong edges that agree shield each other: if one is removed, the others still predict it. The same holds for
+    the correct edges that they displace.
     """
     tried: set[tuple[int, ...]] = set()
     failed = 0
@@ -269,7 +276,7 @@ def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: 
 def _next_group(
     minimizer: Minimizer, minimum: Minimum, price: float, limit: float, tried: set[tuple[int, ...]]
 ) -> NDArray[np.int64]:
-    """The group whose change promises the largest fall of the cost; none where no group of edges is left out."""
+    """The group whose change promises the largest decrease of the cost; empty if no group of edges is rejected."""
     problem, poses = minimizer.problem, minimum.estimate.poses
     kept = minimum.weights > 0.5
     best, most = np.empty(0, np.int64), 0.0
@@ -293,7 +300,7 @@ def _next_group(
 
 
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
-    """Cost of every loop edge in the χ² of the others, (L,)."""
+    """Distance of every loop edge from all other edges, (L,), as of ``Consistency``."""
     kept = minimum.weights > 0.5
     return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.robust]
 
@@ -301,8 +308,9 @@ def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np
 def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) -> Minimum:
     """The minimum of the truncated loss near these poses.
 
-    The graph predicts a revisit the less surely, the longer the path since the last: an edge with a large residual
-    may agree with it all the same. New ones and groups of them that do are taken in where the cost falls.
+    The longer the path since the last revisit, the less certain is the graph's prediction of the next one: an edge
+    with a large residual may be consistent with it. New edges and groups that are consistent are accepted if the
+    cost falls.
     """
     minimum = Focus(minimizer).descend(minimizer.evaluate(poses, loss), loss)
     problem = minimizer.problem
@@ -323,7 +331,7 @@ def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) 
 
 
 def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Since) -> list[NDArray[np.int64]]:
-    """New edges left out with which the cost falls to first order, alone or as groups that agree."""
+    """Rejected new edges that lower the cost to first order, alone or as groups that agree."""
     problem, poses, kept = minimizer.problem, minimum.estimate.poses, minimum.weights > 0.5
     left_out = problem.is_robust & ~kept
     left_out[: since.judged] = False

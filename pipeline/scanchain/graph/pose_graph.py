@@ -39,16 +39,16 @@ class PoseGraph:
     """Poses T_world_lidar and between factors T_ij (frame j seen from frame i) with e = log(T_ij⁻¹ T_i⁻¹ T_j).
 
     Every covariance and information matrix, given or returned, is that of a right twist, T exp(ξ): in the pose's
-    own frame, (translation, rotation). ``Match.information`` is one, so that it serves an edge as it is.
+    own frame, (translation, rotation). ``Match.information`` is one, so that an edge takes it unchanged.
 
-    The gauge is fixed by holding pose 0, or those given to ``fix``, where they are; in a graph with factors of
-    single poses, which hang on the origin of the world, by that.
+    The gauge is fixed by keeping pose 0, or those given to ``fix``, constant; in a graph with unary factors, which
+    refer to the origin of the world, by the origin.
     """
 
     def __init__(self, dimension: int, names: NDArray[np.int64] | None = None, left_out: str = "") -> None:
         """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses with these names in messages.
 
-        left_out : constraints that it lacks, in words, for the certificate to say so
+        left_out : constraints that the graph lacks, as text for the certificate
         """
         dimension = self.dimension = checks.dimension(dimension)
         self._names, self.left_out = names, left_out
@@ -106,19 +106,19 @@ class PoseGraph:
 
     @property
     def drift(self) -> NDArray[np.float64]:
-        """Systematic drift that loop edges show, (2,) or (4,): odometry is too short by a share, turns too little.
+        """Odometry drift inferred from loop edges, (2,) or (4,): the share by which it is too short, missing turn.
 
-        A pure number, and radians a meter about every axis; zero where nothing shows one.
+        A pure number, and radians per meter about every axis; zero if loop edges show no drift.
         """
         return self._explanation.drift
 
     @property
     def loosened(self) -> tuple[Loosened, ...]:
-        """Slips and jumps: segments of odometry that loop edges show to be off by more than their edges say."""
+        """Slips and jumps: segments of odometry whose errors, by loop edges, exceed their covariance."""
         return self._explanation.loosened
 
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
-        """Drift, slips and jumps in words, a line each; ``names`` (K,) number the poses for the reader."""
+        """Drift, slips and jumps as text, one line each; ``names`` (K,) are the displayed numbers of the poses."""
         if not self.drift.any() and not self.loosened:
             return []
         odometry = odometry_of(self.edges, self.is_odometry)
@@ -128,14 +128,14 @@ class PoseGraph:
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k), that of odometry loosened in slips and jumps."""
+        """Ω of every edge, (E, k, k), for odometry with inflated covariance in slips and jumps."""
         return self._applied(self._explanation)[1]
 
     def added_since(self, first: int) -> tuple[Matrix, Matrix]:
-        """``measurements`` and ``information`` of the edges from this one on, at the cost of these alone."""
+        """``measurements`` and ``information`` of this edge and all later ones, without all others if possible."""
         explanation, new = self._explanation, slice(first, None)
         before = int(self.is_odometry[:first].sum())
-        if any(stretch.edges.stop > before for stretch in explanation.loosened):
+        if any(segment.edges.stop > before for segment in explanation.loosened):
             return self.measurements[new], self.information[new]
         drift = Explanation(explanation.drift)
         return drift.applied(
@@ -154,7 +154,7 @@ class PoseGraph:
 
     @property
     def is_of_origin(self) -> NDArray[np.bool_]:
-        """True for every edge that concerns one pose only, (E,)."""
+        """True for every unary edge, which constrains one pose only, (E,)."""
         return self.edges[:, 0] == ORIGIN
 
     @property
@@ -164,7 +164,7 @@ class PoseGraph:
 
     @property
     def weight(self) -> NDArray[np.float64]:
-        """Weight that the last optimization left to every edge, (E,); 1 before."""
+        """Weight of every edge after the last optimization, (E,); 1 before any."""
         return self._weight.rows
 
     @property
@@ -179,18 +179,18 @@ class PoseGraph:
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
-        """True for every fixed pose, (K,); pose 0 where none was named and no factor hangs on the origin."""
+        """True for every fixed pose, (K,); pose 0 if none was given to ``fix`` and there is no unary factor."""
         held = np.zeros(len(self), np.bool_)
         held[sorted(self._fixed) or slice(0, 0 if self._has_origin else 1)] = True
         return held
 
     @property
     def held(self) -> list[int]:
-        """Poses fixed by name through ``fix``, ascending."""
+        """Poses fixed by ``fix``, ascending."""
         return sorted(self._fixed)
 
     def add_pose(self, T_world: Pose, stamp_ns: int) -> int:
-        """Index of the new pose, with this first guess."""
+        """Index of the new pose, which is added with this initial guess."""
         return self._append(checks.pose(T_world, "T_world", self.dimension), stamp_ns, is_point=False)
 
     def add_point(self, position: NDArray[np.float64], stamp_ns: int) -> int:
@@ -215,12 +215,12 @@ class PoseGraph:
     def add_factor(
         self, factor: Factor, j: int, information: Matrix, Z: Pose | None = None, i: int = ORIGIN
     ) -> None:
-        """Add what a factor of ``scanchain.graph.factors``, or one's own, measures of pose j.
+        """Add a measurement of pose j by a factor of ``scanchain.graph.factors`` or a custom one.
 
         information : (m, m) inverse covariance of its m residuals
-        Z : (d+1, d+1) what is measured, where the factor asks for it
+        Z : (d+1, d+1) the measurement, if the factor needs one
         i : the pose from which it is measured; by default the origin of the world
-        Raises InputError for a pose that is not there, and information that is not of its residuals.
+        Raises InputError for an unknown pose, and for information that does not match the factor's residuals.
         """
         checks.instance(factor, Factor, "factor", "an instance of a subclass of scanchain.graph.factors.Factor")
         Z = lie.identity(self.dimension) if Z is None else checks.pose(Z, "Z", self.dimension)
@@ -269,7 +269,7 @@ class PoseGraph:
         self._weight.extend(np.ones(len(edges)))
 
     def remove_loops(self, is_removed: NDArray[np.bool_]) -> None:
-        """Take loop edges out of the graph, True for each of the edges (E,) that goes."""
+        """Remove loop edges; is_removed (E,) is True for each edge to remove."""
         self._changed()
         for column in (
             self._edges, self._measurements, self._information, self._rank, self._kind, self._weight,
@@ -278,7 +278,7 @@ class PoseGraph:
         self.since = Since(0, 0)
 
     def predicted(self, T_ij: Pose) -> Pose:
-        """A motion by odometry, corrected by ``drift``."""
+        """An odometry motion corrected by ``drift``."""
         return corrected(T_ij, self._explanation.drift)
 
     def fix(self, index: int) -> None:
@@ -292,14 +292,14 @@ class PoseGraph:
         self._fixed.add(index)
 
     def move(self, first: int, T_new_old: Pose) -> None:
-        """Move this pose and all later ones rigidly, as a first guess."""
+        """Move this pose and all later ones rigidly, as an initial guess."""
         poses = self.poses.copy()
         poses[first:] = checks.pose(T_new_old, "T_new_old", self.dimension) @ poses[first:]
         self._changed()
         self._poses.replace(poses)
 
     def remeasure(self, edge: int) -> None:
-        """Replace what an edge measures by what the poses of now have between its ends."""
+        """Replace the measurement of an edge by the relative pose of its ends at the current poses."""
         measurements, (i, j) = self._measurements.rows.copy(), self.edges[edge].tolist()
         measurements[edge] = lie.between(self.poses[i], self.poses[j])
         self._changed()
@@ -308,10 +308,10 @@ class PoseGraph:
     def optimize(
         self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: Rejection = "judge"
     ) -> Optimization:
-        """Move the poses to the minimum of χ², starting from the chosen guess.
+        """Move the poses to the minimum of χ², starting from the chosen initialization.
 
-        rejection : of loop edges under the truncated loss: "judge" all of them anew, or "update", which is cheap:
-            it begins with the verdicts at hand and judges new edges by these
+        rejection : of loop edges under the truncated loss: "judge" classifies all of them again; "update" is
+            cheap: it starts from the present verdicts and judges new edges against these
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")
@@ -346,9 +346,9 @@ class PoseGraph:
         )
 
     def optimize_end(self, config: GraphConfig, first: int, rejection: Rejection) -> None:
-        """Move the poses from this one on, all others held.
+        """Optimize this pose and all later ones, with all others fixed.
 
-        rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
+        rejection : as in ``optimize``; loop edges that are judged may also be explained by jumps of odometry there
         """
         chosen = np.flatnonzero((self.edges >= first).any(axis=1))
         edges, kind, is_odometry = self._joined[chosen], self._kind.rows[chosen], self.is_odometry[chosen]
@@ -374,7 +374,7 @@ class PoseGraph:
         self._changed()
 
     def copy(self) -> PoseGraph:
-        """The graph as it is, independent of what becomes of this one."""
+        """An independent copy of the graph."""
         result = PoseGraph(self.dimension, self._names, self.left_out)
         for name, rows in vars(self).items():
             if isinstance(rows, GrowingArray):
@@ -385,7 +385,7 @@ class PoseGraph:
         return result
 
     def with_information(self, information: Matrix) -> PoseGraph:
-        """A copy whose edges have these information matrices (E, k, k), its measurements as corrected here."""
+        """A copy with these information matrices (E, k, k) and the corrected measurements of this graph."""
         result = self.copy()
         result._measurements.replace(self.measurements)
         result._information.replace(information)
@@ -393,7 +393,7 @@ class PoseGraph:
         return result
 
     def take_over(self, optimized: PoseGraph) -> None:
-        """Take what optimizing a ``copy`` led to; poses added since move along with the last one before them."""
+        """Adopt the result of optimizing a ``copy``; poses added since move with the last one before them."""
         count, edges = len(optimized), len(optimized.edges)
         T_new_old = optimized.poses[-1] @ lie.inverse(self.poses[count - 1])
         self._poses.replace(np.concatenate([optimized.poses, T_new_old @ self.poses[count:]]))
@@ -403,17 +403,17 @@ class PoseGraph:
         self._changed()
 
     def certify(self) -> Certificate:
-        """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""
+        """Certificate of the global minimum of χ², with the edge weights of the last optimization."""
         found = certify(self._prepared(), self._vertices, self._weight_in_force, self._undetermined(), self.names)
         return replace(found, left_out=self.left_out)
 
     def free_poses(self) -> NDArray[np.int64]:
-        """Names of the poses that the edges in force leave free in some direction, at the poses of now."""
+        """Names of the poses that the edges in force leave free in some direction, at the current poses."""
         self._factor_is_now = False
         return free_poses(self._prepared(), self._vertices, self._weight_in_force, self._rank.rows, self.names)
 
     def weakly_joined(self) -> NDArray[np.int64]:
-        """Names of the poses that hang on edges in force of next to no information."""
+        """Names of the poses joined to a fixed one only by edges in force with almost no information."""
         kept = ~self.is_rejected
         information = self.weight[kept, None, None] * self.information[kept]
         return self.names[weakly_joined(self._joined[kept], information, self._fixed_vertices)]
@@ -434,19 +434,19 @@ class PoseGraph:
         )
 
     def relative_covariance(self, i: int, j: int) -> Matrix:
-        """Covariance (k, k) of T_ij = T_i⁻¹ T_j, a right twist on it as in ``add_edge``, at the poses of now.
+        """Covariance (k, k) of T_ij = T_i⁻¹ T_j, a right twist on it as in ``add_edge``, at the current poses.
 
-        Of left twists it is Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ. The factor of H is kept until the graph changes,
-        so that each further pair costs k solves.
+        In terms of left twists it is Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ. The factor of H is retained until the
+        graph changes, so that each further pair costs k solves.
         """
         adjoint = lie.adjoint(lie.inverse(self.poses[j]))
         return adjoint @ difference_covariances(self._factored(), np.array([[i, j]]))[0, 0] @ adjoint.T
 
     def covariances(self) -> Matrix:
-        """Covariance (K, k, k) of every pose's right twist, T exp(ξ), by the edges in force, at the poses of now.
+        """Covariance (K, k, k) of every pose's right twist, T exp(ξ), by the edges in force, at the current poses.
 
         By the selected inverse of H over such twists; zero for fixed poses, 2 × 2 for points: m², m rad, rad².
-        Raises InputError where the edges leave poses free, or as good as free.
+        Raises InputError where the edges leave poses free, or nearly free.
         """
         problem, undetermined = self._prepared(), self._undetermined()
         if undetermined:
@@ -462,18 +462,19 @@ class PoseGraph:
         return result
 
     def pose_errors(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        """Errors (count, K, k) of all poses, drawn from their joint distribution by the edges in force.
+        """Errors (count, K, k) of all poses, sampled from their joint distribution by the edges in force.
 
-        Of position and orientation, along the world's axes. Raises InputError where the edges leave poses free.
+        They are of position and orientation, along the world's axes. Raises InputError where the edges leave poses
+        free.
         """
         count = checks.integer(count, "count", "a number of samples, 1 or more", least=1)
         return pose_errors(self._factored(), self._vertices, count, seed)[:, : len(self)]
 
     def displacements(self, changes: Matrix) -> NDArray[np.float64]:
-        """Changes (G, K, k) of all poses, to first order, where the measured motions T_ij become T_ij exp(change).
+        """First-order changes (G, K, k) of all poses when the measured motions T_ij become T_ij exp(change).
 
-        changes : (G, E, k) twists. Of position and orientation, along the world's axes. Raises InputError where
-        the edges leave poses free.
+        changes : (G, E, k) twists. The result is in position and orientation, along the world's axes. Raises
+        InputError where the edges leave poses free.
         """
         return displacements(self._factored(), self._vertices, self.weight, changes)[:, : len(self)]
 
@@ -504,7 +505,7 @@ class PoseGraph:
         return self._problem
 
     def _problem_of(self, explanation: Explanation) -> GraphProblem:
-        """The problem under an explanation; the one that is there already, if it is that."""
+        """The problem under an explanation; the existing one if it has this explanation."""
         if self._problem is not None and explanation is self._explanation:
             return self._problem
         applied, kind = self._applied(explanation), self._kind.rows
@@ -517,18 +518,18 @@ class PoseGraph:
         return explanation.applied(self.edges, self._measurements.rows, self._information.rows, self.is_odometry)
 
     def _undetermined(self) -> str:
-        """Free poses, with which nothing can be computed, as text; empty without any."""
+        """Free poses, which preclude covariances and certificates, as text; empty without any."""
         free = self.free_poses()
         return free_text(free) if len(free) else ""
 
     def _singular(self, error: SingularMatrixError, fixed: NDArray[np.bool_]) -> InputError:
-        """The error for poses that their edges leave free, or as good as free."""
+        """The error for poses that their edges leave free, or nearly free."""
         variable = np.flatnonzero(~fixed)[[error.variable]]
         return _refused(self._undetermined() or free_text(self.names[variable]))
 
     @property
     def _has_origin(self) -> bool:
-        """Whether some factor hangs on the origin, which is then a vertex more, the last one, and fixed."""
+        """Whether some factor refers to the origin, which is then an additional, fixed vertex, the last one."""
         return bool(self.is_of_origin.any())
 
     @property
@@ -549,7 +550,7 @@ class PoseGraph:
         return np.where(self.edges == ORIGIN, len(self), self.edges) if self._has_origin else self.edges
 
     def _of_vertices(self, of_poses: NDArray[Any], of_origin: object) -> NDArray[Any]:
-        """The same (K, ...) with that of the origin behind it, where the graph has it."""
+        """Values of the poses (K, ...), with that of the origin appended where the graph has it."""
         return np.concatenate([of_poses, np.asarray(of_origin)[None]]) if self._has_origin else of_poses
 
     @property
@@ -557,7 +558,7 @@ class PoseGraph:
         return self.weight * ~self.is_rejected
 
     def _in_force(self, chi2: NDArray[np.float64]) -> float:
-        """The sum of w χ² over the edges in force, of χ² (E,)."""
+        """The sum of w χ² over the edges in force; χ² (E,)."""
         return float((self.weight * chi2)[~self.is_rejected].sum())
 
     def _changed(self) -> None:

@@ -25,7 +25,7 @@ class NormalEquations:
 
 
 class GraphProblem:
-    """Factors of one graph, χ² = Σ eᵀΩe; the structure is worked out once.
+    """Factors of one graph, χ² = Σ eᵀΩe; the structure is computed once.
 
     Poses move by left twists, T ← exp(ξ) T. The gauge is fixed by leaving the fixed poses out of the system:
     ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,) the pose of each block,
@@ -46,7 +46,7 @@ class GraphProblem:
     ) -> None:
         """Edges (E, 2) pairs (i, j), Z (E, d+1, d+1) measurements, Ω (E, k, k); fixed, is_point (K,).
 
-        kind : (E,) places in the table of factors; by default as ``kinds_of`` edges none of which is a loop
+        kind : (E,) indices into ``factors``; by default those that ``kinds_of`` gives without loops
         """
         self.edges, self.information = read_only(edges), read_only(information)
         self.measurements = read_only(measurements)
@@ -90,12 +90,12 @@ class GraphProblem:
 
     @cached_property
     def is_bounded(self) -> NDArray[np.bool_]:
-        """True for every edge of whose χ² the certificate has a lower bound, (E,)."""
+        """True for every edge for whose χ² the certificate has a lower bound, (E,)."""
         return self._are("is_bounded")
 
     @property
     def has_landmarks(self) -> bool:
-        """Whether positions are seen from poses."""
+        """Whether some edge measures a position seen from a pose."""
         return bool(np.isin(self.kind, SIGHTINGS).any())
 
     @property
@@ -119,7 +119,7 @@ class GraphProblem:
     def factored(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> GraphProblem:
         """The problem of some of the edges, kept (E,), with H factored at these poses and their errors (E, k).
 
-        The factor of this one is given up: two of a long log would take the most memory of all.
+        The factor of this problem is released: two factors of a long log would dominate the memory.
         """
         if "cholesky" in vars(self):
             self.cholesky.release()
@@ -158,7 +158,7 @@ class GraphProblem:
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient))
 
     def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:
-        """Blocks (B, b, b) of the pattern, of what every edge adds (E, b, b): to those of i, of j and of the pair.
+        """Blocks (B, b, b) of the pattern, summed over what every edge adds (E, b, b) for i, j and the pair.
 
         coupling : row i, column j
         """

@@ -1,4 +1,4 @@
-"""Schedule of the optimizations of a pose graph that grows: when, of which poses, and with which verdicts."""
+"""Schedule of the optimizations of a growing pose graph: when, of which poses, and whether verdicts are kept."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.processes import return_freed_memory
 
-_LEAST = 10  # number of keyframes between two optimizations
-_GROWTH = 0.05  # share of the poses, in keyframes until they are judged again, or where no closure moves the map
-LAG = 200  # number of the last poses that are updated where all are too much work
-_LARGE = 2000  # number of poses that are judged together at most; from which on work is done beside a live log
-_WORK_PER_KEYFRAME = 1e6  # multiplications to update all poses, at most, for each keyframe since
-_CONTRADICTING = 10.0  # times the χ² limit of a loop edge, from which on a closure contradicts the graph
-_TAKEN_AFTER = {"update": 0.005, "judge": 0.1}  # share of the poses moved, in keyframes until that is taken over
+_LEAST = 10  # least number of keyframes between two optimizations
+_GROWTH = 0.05  # keyframes, as a share of the poses, until these are judged again, or if no closure moves the map
+LAG = 200  # number of the last poses, which are updated where updating all is too much work
+_LARGE = 2000  # largest number of poses judged together; from this number, live logs are optimized in a thread
+_WORK_PER_KEYFRAME = 1e6  # largest number of multiplications to update all poses, per keyframe since the last time
+_CONTRADICTING = 10.0  # factor on the χ² limit of a loop edge, above which a closure contradicts the graph
+_TAKEN_AFTER = {"update": 0.005, "judge": 0.1}  # keyframes until a result is adopted, per pose moved
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An optimization: of the poses from one on, and whether verdicts are kept or all judged anew."""
+    """An optimization: index of its first pose, and whether verdicts are kept or all edges judged again."""
 
     first: int
     rejection: Literal["update", "judge"]
 
     def carry_out(self, graph: PoseGraph, config: GraphConfig) -> None:
-        """Optimize the graph from the poses at hand."""
+        """Optimize the graph from its current poses."""
         if self.first:
             graph.optimize_end(config, self.first, self.rejection)
         else:
@@ -37,14 +37,14 @@ class Plan:
 
 
 class BackgroundOptimization:
-    """An optimization in a thread of the graph as it was when it began.
+    """Optimization of a copy of the graph in a background thread.
 
-    ``due`` is the number of poses at which it is to be taken over, so that the result does not depend on how fast
-    the thread is.
+    ``due`` is the number of poses at which its result is adopted, which makes this independent of the speed of the
+    thread.
     """
 
     def __init__(self, graph: PoseGraph, config: GraphConfig, plan: Plan, due: int) -> None:
-        """Begin; a copy of the graph is optimized, from the poses at hand."""
+        """Start the thread, which optimizes a copy of the graph from its current poses."""
         self.due, self.config, self.plan = due, config, plan
         self.before = graph.copy()
         self._thread: Thread | None = Thread(target=self._optimize, daemon=True)
@@ -52,7 +52,7 @@ class BackgroundOptimization:
         self._thread.start()
 
     def result(self) -> PoseGraph:
-        """The optimized graph, once it is done. Raises what ``PoseGraph.optimize`` does."""
+        """The optimized graph; waits for the thread. Raises what ``PoseGraph.optimize`` does."""
         if self._thread is not None:
             self._thread.join()
         elif self._outcome is None:  # from a checkpoint, which does not hold the thread
@@ -73,27 +73,27 @@ class BackgroundOptimization:
 
 
 class Schedule:
-    """Optimizes a growing graph once the closures that wait may move its map by more than a voxel.
+    """Optimizes a growing graph once pending closures may move its map by more than a voxel.
 
-    As long as most closures agree with the graph, an update keeps the verdicts at hand: of all poses where the
-    work for it is within bounds, else of the last ones. Where more contradict it than agree since a pose, all from
-    that pose on is judged anew, with what odometry may have got wrong there.
+    As long as most closures agree with the graph, an update keeps the present verdicts. It covers all poses where
+    the work is affordable, otherwise the last ones. If more closures contradict the graph than agree since some
+    pose, all loop edges from that pose on are judged again, including possible odometry errors there.
     """
 
     def __init__(self, graph: PoseGraph, config: GraphConfig, voxel_m: float) -> None:
-        """voxel_m : of the map, whose error is to stay below it."""
+        """voxel_m : voxel size of the map, whose error shall stay below it."""
         self.graph, self.config, self.voxel_m = graph, config, voxel_m
-        self.waits = self.moves = False  # whether closures wait, and may move the map by more than a voxel
+        self.waits = self.moves = False  # whether closures are pending, and may move the map by more than a voxel
         self.joins = False  # whether one of them joins a segment
-        self.excess = 0  # of the closures that contradict the graph over those that agree, since a pose
-        self.agreed_at = 0  # that pose: the last at which there was none
-        self.optimized_at = self.updated_at = self.judged_at = 0  # number of poses: at the last, of all, judged
-        self.beside: BackgroundOptimization | None = None
+        self.excess = 0  # closures that contradict the graph minus those that agree, since a pose
+        self.agreed_at = 0  # that pose: the last at which the excess was zero
+        self.optimized_at = self.updated_at = self.judged_at = 0  # poses at the last optimization, of all, judged
+        self.background: BackgroundOptimization | None = None
 
     def note(self, source: int, moves_m: float, chi2: float, *, joins: bool = False) -> None:
-        """Note a closure that was added: its newer pose, how far it may move the map, and its χ² before.
+        """Record an added closure: its newer pose, how far it may move the map, and its χ² before optimization.
 
-        joins : whether it is the first to join a segment, which was moved to where it says
+        joins : whether it is the first to join a segment, which was moved to the pose it measures
         """
         self.waits, self.joins = True, self.joins or joins
         self.moves |= moves_m > self.voxel_m
@@ -102,12 +102,12 @@ class Schedule:
         self.agreed_at = self.agreed_at if self.excess else source
 
     def advance(self, *, is_live: bool = False) -> int:
-        """Optimize if it is time; the first pose that moved, or the number of all where none did.
+        """Optimize if due; index of the first pose that moved, or the number of poses if none did.
 
-        is_live : whether all but short optimizations of a large graph are made beside
+        is_live : whether to optimize a large graph in a background thread, except for short optimizations
         """
         count = len(self.graph)
-        if self.beside is not None and count >= self.beside.due:
+        if self.background is not None and count >= self.background.due:
             return self.take_over()
         if self.joins:
             return self.optimize()
@@ -121,34 +121,34 @@ class Schedule:
         if is_live and count >= _LARGE and plan != self._of_end:
             self._begin_waiting(plan)
             due = count + max(int(_TAKEN_AFTER[plan.rejection] * (count - plan.first)), _LEAST)
-            self.beside = BackgroundOptimization(self.graph, self.config, plan, due)
+            self.background = BackgroundOptimization(self.graph, self.config, plan, due)
             return count
         self._carry_out(plan)
         return plan.first
 
     def optimize(self) -> int:
-        """Optimize all poses now, as a segment was moved or the first pose given; 0, the first that moves."""
-        self.beside = None
+        """Optimize all poses now, after a segment was moved or the first pose given; 0, the first that moves."""
+        self.background = None
         self.waits = self.moves = self.joins = False
         self.optimized_at = len(self.graph)
         self._carry_out(Plan(0, "judge"))
         return 0
 
     def stop(self) -> None:
-        """Take nothing over of what is optimized beside: the graph was changed."""
-        self.beside = None
+        """Discard the background optimization, since the graph was changed."""
+        self.background = None
 
     def finish(self) -> GraphState:
-        """Optimize for the last time, all closures judged anew; the graph as it is then."""
-        if self.beside is not None:
+        """Optimize for the last time, with all closures judged again; the resulting graph."""
+        if self.background is not None:
             self.take_over()
         return self.graph.optimize(self.config, initialize="given").state
 
     def take_over(self) -> int:
-        """Take the result of the optimization beside, of the graph as it was when that began."""
-        assert self.beside is not None
-        self.graph.take_over(self.beside.result())
-        self.beside = None
+        """Adopt the result of the background optimization; 0, the first pose that moves."""
+        assert self.background is not None
+        self.graph.take_over(self.background.result())
+        self.background = None
         self._count_excess()
         return 0
 
@@ -162,9 +162,9 @@ class Schedule:
         return Plan(max(len(self.graph) - LAG, 0), "update")
 
     def _next(self) -> Plan:
-        """What is to be optimized now, as far as the work is within bounds."""
+        """The next optimization, limited to an affordable amount of work."""
         count = len(self.graph)
-        if self.beside is not None:
+        if self.background is not None:
             return self._of_end
         if self.excess:
             first = 0 if self._size <= _LARGE else max(self.agreed_at - LAG, count - _LARGE)
@@ -186,7 +186,7 @@ class Schedule:
         self.judged_at = count if plan.rejection == "judge" else self.judged_at
 
     def _count_excess(self) -> None:
-        """Count anew, by the verdicts at hand."""
+        """Recompute the excess from the present verdicts."""
         graph = self.graph
         rejected = graph.is_rejected[graph.is_loop & (graph.edges[:, 1] >= self.agreed_at)]
         self.excess = max(2 * int(rejected.sum()) - len(rejected), 0)

@@ -1,1 +1,1 @@
-"""Everything compiled: arrays in, arrays out."""
+"""Compiled kernels: arrays in, arrays out."""

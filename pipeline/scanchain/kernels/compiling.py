@@ -1,4 +1,4 @@
-"""``njit`` of this project: ``numba.njit`` with a cache on disk that several processes may fill at once."""
+"""``njit`` of this project: ``numba.njit`` with an on-disk cache that several processes may write concurrently."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def digest_of_sources() -> str:
 
 
 def _cache_by_source() -> None:
-    """Keep compiled kernels in a folder of the user's cache that is named after their source.
+    """Cache compiled kernels in a folder of the user's cache that is named after the hash of their sources.
 
-    Numba looks at the file of a kernel only, not at those of the kernels that it calls: after a change to one of
-    them, by an editor or an upgrade, a cache beside the source would go on with what was compiled before. A folder
-    that is chosen by NUMBA_CACHE_DIR stays; where no folder can be made, or others may write to it (what is read
-    is executed), Numba looks for a place as it is used to.
+    Numba checks the file of a kernel only, not those of the kernels that it calls: after a change to one of
+    them, by an editor or an upgrade, a cache next to the source would keep using the outdated code. A folder
+    set by NUMBA_CACHE_DIR is respected; where no folder can be made, or others may write to it (what is read
+    is executed), Numba chooses the location by its own rules.
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
         return
@@ -43,9 +43,9 @@ def _cache_by_source() -> None:
         folder = root / "scanchain" / "kernels" / digest_of_sources()[:16]
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
-    except (OSError, RuntimeError):  # the latter of a user without a home
+    except (OSError, RuntimeError):  # RuntimeError for a user without a home
         return
-    is_own = hasattr(os, "geteuid") and status.st_uid == os.geteuid()  # never known on Windows
+    is_own = hasattr(os, "geteuid") and status.st_uid == os.geteuid()  # cannot be determined on Windows
     if is_own and not status.st_mode & 0o022 and os.access(folder, os.W_OK):
         config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -55,13 +55,13 @@ _cache_by_source()
 
 @cache
 def _warn(why: str) -> None:
-    """Say once why kernels are not kept."""
+    """Warn once why kernels are not cached."""
     told = "compiled kernels are not kept, every process compiles them again: %s; set NUMBA_CACHE_DIR to a folder"
     logging.getLogger("scanchain").warning(told, why)
 
 
 class _CheckedFiles(IndexDataCacheFile):
-    """A file for each function and types, with a checksum; without Numba's index, which processes would share."""
+    """One file per function and signature, with a checksum; no index as in Numba, which processes would share."""
 
     def save(self, key: Any, data: Any) -> None:
         content = self._dump(data)
@@ -83,7 +83,7 @@ class _CheckedFiles(IndexDataCacheFile):
 
 
 class _Cache(FunctionCache):
-    """Keeps what is compiled where it can, and says once where it cannot."""
+    """Cache of compiled code; warns once where it cannot be written."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -98,9 +98,9 @@ class _Cache(FunctionCache):
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.njit`` of a kernel, whose machine code is kept for later processes; it divides as NumPy does.
+    """``numba.njit`` of a kernel, whose machine code is cached for later processes; it divides as NumPy does.
 
-    A small kernel that only kernels call is best with ``inline="always"``: a quarter of a second less to compile.
+    A small kernel that only kernels call should use ``inline="always"``: it compiles 0.25 s faster.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:

@@ -1,4 +1,4 @@
-"""Points compared with the ranges of a lidar elsewhere: on its surfaces, behind them, or in its free space."""
+"""Points compared with the ranges of a scan from elsewhere: on its surfaces, behind them, or in free space."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ _BLOCK = 256  # points whose directions are computed together
 
 @njit(nogil=True)
 def nearest_ranges(points, ranges_m):
-    """Fill ``ranges_m`` (E, A) with the least range in each bin of direction, FAR where no point is.
+    """Fill ``ranges_m`` (E, A) with the least range in each bin of direction, FAR without a point.
 
     points : (N, 3) meters, lidar frame; rows are E equal steps of elevation from −π/2 to π/2, columns A equal
     steps of azimuth from −π
@@ -30,8 +30,8 @@ def nearest_ranges(points, ranges_m):
 def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
     """Numbers of points (N, 3), moved by T (4, 4) into the lidar's frame, that agree and that contradict.
 
-    A point agrees where its range is that of its bin, within the margin: so many meters and such a share of the
-    range. It contradicts where all rays of its bin went on behind it. Others are hidden or out of sight.
+    A point agrees where its range is that of its bin, within the margin, ``margin_m`` plus ``margin_share``
+    of the range. It contradicts where all rays of its bin ended behind it. Others are occluded or out of view.
     """
     agreeing = contradicting = 0
     rows, columns, ranges, heights = _room()
@@ -52,20 +52,20 @@ def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
 
 @njit(nogil=True)
 def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through):
-    """Count, for each point, the scan as one that saw a surface there or saw through it.
+    """Count, for each point, whether this scan saw a surface there or saw through it.
 
     All rays that pass within half the window of the point, to its sides and above it, are compared; below it, a
-    single bin, or else the ground would confirm what passes above it. The point was seen where the nearest of them
-    ended there, within the margin: so a thin pole before a far wall is not free space, though most rays miss
-    it. It was seen through where the nearest went on behind it, unless that one ended at the same height, as
-    rays do on ground that they graze, and where one is within a bin of its direction. Where some ended before it,
-    the bin of its direction alone is compared: what hides a point does not hide those beside it. Otherwise it is
-    hidden or out of sight.
+    single bin, or else the ground would confirm what moves above it. The point was seen where the shortest of them
+    ended there, within the margin: a thin pole before a far wall is not free space, though most rays miss it. It
+    was seen through where the shortest ended behind it, unless that one ended at the same height, as rays do that
+    graze the ground, and only if a ray is within a bin of its direction. Where some ended before the point, only
+    the bin of its direction is compared: what occludes a point need not occlude its neighbors. Otherwise it is
+    occluded or out of view.
 
     points : (N, 3) meters, world; spans : (S, 2) int64 first and last + 1 of the points to test
     T : (4, 4) T_lidar_world; ranges_m : (E, A) of ``nearest_ranges``; one row for scans in a plane
     limits : (6,) reach m; window m; margin of a range m, and per meter; margin of a height m, and per meter
-    enough : points that so many scans saw are not tested again
+    enough : points that this many scans saw are not tested again
     seen, seen_through : (N,) int32, changed in place
     """
     reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
@@ -113,9 +113,9 @@ def _sight(row, column, range_m, z, ranges_m, window_m, margin_m, margin_share, 
 
 @njit(forceinline=True)
 def _least(ranges_m, row, column, half, enough_m):
-    """Least range, or any below ``enough_m``, and its row; of the bins ``half`` away at most, below 1.
+    """Least range, or any below ``enough_m``, and its row, in bins at most ``half`` away, at most 1 below.
 
-    Columns are closed in a ring.
+    Columns wrap around.
     """
     rows, columns = ranges_m.shape
     least_m, row_of_least = FAR, row
@@ -131,7 +131,7 @@ def _least(ranges_m, row, column, half, enough_m):
 
 @njit(forceinline=True)
 def _room():
-    """Arrays for ``_locate``."""
+    """Buffers for ``_locate``."""
     return np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int32), np.empty(_BLOCK), np.empty(_BLOCK)
 
 
@@ -139,7 +139,7 @@ def _room():
 def _locate(points, T, shape, rows, columns, ranges, heights):
     """Row and column of the direction of each point (N, 3) moved by T (4, 4), its range and its height.
 
-    Without a branch, and coordinates are read a fixed step apart: the compiler makes vector instructions of it.
+    Without branches and with coordinates read at a fixed stride, so that the compiler vectorizes it.
     """
     flat = points.reshape(-1)
     rxx, rxy, rxz, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]

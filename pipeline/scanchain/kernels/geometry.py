@@ -1,4 +1,4 @@
-"""Poses (d+1, d+1) of SE(2) and SE(3) with their twists (translation, rotation); and whether arrays are finite."""
+"""Poses (d+1, d+1) of SE(2) and SE(3) with their twists (translation, rotation); checks of finite arrays."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain.kernels.compiling import njit
 
-_BLOCK = 512  # entries that are compared at once with the largest before
+_BLOCK = 512  # entries per block that are compared with the largest value so far
 _SMALL = 1e-8  # sine of half the angle, below which the series is exact
 
 
@@ -161,8 +161,8 @@ def twist_2d(T):
 def quaternions(R, out):
     """Write unit quaternions xyzw, w ≥ 0, of rotations (N, 3, 3) to ``out`` (N, 4).
 
-    The largest of the four components is found first, so that no difference of near numbers is divided by
-    (Shepperd 1978).
+    The largest of the four components is found first, so that the divisor is never a difference of nearly
+    equal numbers (Shepperd 1978).
     """
     for n in range(R.shape[0]):
         _quaternion(R[n], out[n])
@@ -233,7 +233,7 @@ def _quaternion(R, out):
 def orthonormalize(T):
     """Make the rotation of T exactly orthonormal again, in place, by Gram–Schmidt.
 
-    Rounding that a transpose takes for an inverse grows 2.4-fold from scan to scan under constant velocity.
+    Where a transpose is used as the inverse, rounding errors grow 2.4-fold per scan at constant velocity.
     """
     d = T.shape[0] - 1
     for row in range(d):
@@ -258,7 +258,7 @@ def largest_magnitude(array) -> float:
     for start in range(0, values.size, _BLOCK):
         part = values[start : start + _BLOCK]
         larger = 0
-        for i in range(part.size):  # vector instructions, as nothing here depends on the entry before
+        for i in range(part.size):  # vectorizes, as no iteration depends on the one before
             larger += not abs(part[i]) <= largest
         for i in range(part.size if larger else 0):
             value = abs(part[i])
@@ -273,7 +273,7 @@ def largest_magnitude(array) -> float:
 def rigidity_error(T) -> float:
     """Largest |entry| of RᵀR − I and of the last row less (0, …, 0, 1) of T (d+1, d+1).
 
-    At least 2 where det R < 0, as a reflection has it; infinite where an entry is not finite.
+    At least 2 where det R < 0, i.e. for a reflection; infinite where an entry is not finite.
     """
     d = T.shape[0] - 1
     error = 0.0

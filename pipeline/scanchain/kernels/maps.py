@@ -1,4 +1,4 @@
-"""Maps of points: running means per voxel, and beams drawn into an occupancy grid."""
+"""Maps of points: running means per voxel, and beams rasterized into an occupancy grid."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ from scanchain.kernels.voxels import REACH, find, key_of
 
 @njit(nogil=True)
 def add_points(points, sums_of, counts_of, voxel_m, center, slots, cells, sums, counts, used):
-    """Add points, or means of several, to the sums of their voxels, until the table is full.
+    """Add points, or means of several, to the sums of their voxels until the table is full.
 
-    points : (N, d) meters, finite; sums_of (N, d) and counts_of (N,) of what each is the mean of
-    center : (3,) meters, of the space in which each voxel has a key of its own; it counts as full beyond
-    slots : (S,) int64 keys and cells : (S,) int32 the row that each key has; sums : (C, d) meters and counts :
-        (C,) int64, of which the first ``used`` rows are taken
-    Returns the rows taken now and the number of points done: fewer than N where rows or keys did not suffice.
+    points : (N, d) meters, finite; sums_of (N, d) and counts_of (N,) of the points that each is the mean of
+    center : (3,) meters, of the region in which voxel keys are unique; a point beyond counts as a full table
+    slots : (S,) int64 keys and cells : (S,) int32 row of each key; sums : (C, d) meters and counts :
+        (C,) int64, of which the first ``used`` rows are in use
+    Returns the new number of rows in use and of points added: fewer than N where rows or keys did not suffice.
     """
     d, scale = points.shape[1], 1.0 / voxel_m
     for i in range(points.shape[0]):
@@ -39,7 +39,7 @@ def add_points(points, sums_of, counts_of, voxel_m, center, slots, cells, sums, 
 def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, miss, low, high, log_odds, drawn):
     """Add the evidence of several scans: the cells that beams cross are free, the cells they end in occupied.
 
-    A scan counts once in a cell, and an end outweighs any crossing: without that, beams that pass a wall at a
+    A scan counts once per cell, and an end outweighs any crossing: without that, beams that pass a wall at a
     grazing angle erase it. Bayes' rule in log-odds (Moravec & Elfes 1985; Thrun, Burgard & Fox 2005, table 9.1)
     with clamping (Hornung et al. 2013, eq. 5).
 
@@ -67,7 +67,7 @@ def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, mis
 
 @njit(inline="always")
 def _carve(x, y, end_x, end_y, number, miss, low, log_odds, drawn):
-    """Free every cell from (x, y) up to, not including, that of the end (Amanatides & Woo 1987); unit: cells."""
+    """Lower every cell from (x, y) up to, not including, that of the end (Amanatides & Woo 1987); unit: cells."""
     column, row = int(x), int(y)
     dx, dy = end_x - x, end_y - y
     step_x, step_y = 1 if dx > 0.0 else -1, 1 if dy > 0.0 else -1

@@ -6,8 +6,8 @@ import numpy as np
 
 from scanchain.kernels.compiling import njit
 
-_SWEEPS = 30  # largest number of sweeps of rotations; a handful does
-_BESIDE = 1e-16  # largest off-diagonal entry as a share of the diagonal
+_SWEEPS = 30  # largest number of sweeps of rotations; a few suffice
+_BESIDE = 1e-16  # largest off-diagonal entry of a converged matrix, as a share of the diagonal
 
 
 @njit(inline="always")
@@ -66,7 +66,7 @@ def eigenvector_3d(xx: float, xy: float, xz: float, yy: float, yz: float, zz: fl
 def eigensystem(A, values, vectors):
     """Eigenvalues, ascending, of a small symmetric matrix A (k, k) and its unit eigenvectors, a column each.
 
-    Cyclic Jacobi rotations until nothing is left beside the diagonal (Golub & Van Loan, ch. 8.5). Overwrites A.
+    Cyclic Jacobi rotations until off-diagonal entries vanish (Golub & Van Loan, ch. 8.5). Overwrites A.
     """
     k = A.shape[0]
     for i in range(k):
@@ -102,7 +102,7 @@ def _rotate_pair(A, V, p: int, q: int):
 
 @njit(inline="always")
 def _sort_columns(values, vectors):
-    """Bring eigenvalues into ascending order, their vectors along."""
+    """Sort eigenvalues ascending, together with their vectors."""
     for i in range(1, values.shape[0]):
         j = i
         while j > 0 and values[j] < values[j - 1]:
@@ -114,7 +114,7 @@ def _sort_columns(values, vectors):
 
 @njit(nogil=True)
 def factorize(H, damping: float, factor) -> bool:
-    """Write L with L Lᵀ = H + damping · diag(H) to the lower half of ``factor``; False where there is none."""
+    """Write L with L Lᵀ = H + damping · diag(H) to the lower half of ``factor``; False if indefinite."""
     k = H.shape[0]
     for i in range(k):
         for j in range(i + 1):
@@ -148,7 +148,7 @@ def substitute(factor, b, x):
 
 @njit(nogil=True)
 def definite_inverse(matrix):
-    """Inverse of a positive definite (k, k), of another zeros."""
+    """Inverse of a positive definite matrix (k, k); zeros where it is not."""
     k = matrix.shape[0]
     out, factor, b, x = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k), np.empty(k)
     if factorize(matrix, 0.0, factor):

@@ -17,7 +17,7 @@ def cast_rays(
     """Range to the first hit of every ray; inf where nothing is within reach.
 
     Solids are seen from the outside only: a ray that starts inside one passes through it. Each ray tests the
-    solids of its azimuth sector from near to far, and stops where the next cannot begin before its best hit.
+    solids of its azimuth sector from near to far, and stops where the next begins beyond its nearest hit so far.
 
     origins, rotations : (P, 3) meters and (P, 3, 3), sensor poses in the world, near to each other
     pose_of_ray : (N,) int32, the pose that ray n is fired from
@@ -37,7 +37,7 @@ def cast_rays(
         dx = rotations[p, 0, 0] * x + rotations[p, 0, 1] * y + rotations[p, 0, 2] * z
         dy = rotations[p, 1, 0] * x + rotations[p, 1, 1] * y + rotations[p, 1, 2] * z
         dz = rotations[p, 2, 0] * x + rotations[p, 2, 1] * y + rotations[p, 2, 2] * z
-        steep = dz < -0.1  # hits the ground soon; a shallow ray is mostly stopped by a solid before
+        steep = dz < -0.1  # soon hits the ground; a shallow ray mostly hits a solid first
         best = max_range_m
         if steep:
             best = min(best, hit_ground(ox, oy, oz, dx, dy, dz, ground, best))
@@ -114,7 +114,8 @@ def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, e):
 def hit_ground(ox, oy, oz, dx, dy, dz, ground, max_range_m):
     """Distance at which a ray from above first meets the ground, inf if it does not.
 
-    Rough ground lies below its two long waves lifted by the sum of the short ones, so the ray meets those first.
+    Rough ground lies below its two long waves raised by the amplitudes of the short ones, which the ray
+    meets first.
     """
     if len(ground) == 7:
         return _descend(ox, oy, oz, dx, dy, dz, ground, 0.0, max_range_m)
@@ -129,7 +130,7 @@ def hit_ground(ox, oy, oz, dx, dy, dz, ground, max_range_m):
 
 @njit()
 def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
-    """Distance of the first root of the gap f(t) = z − h at or beyond ``start_m``, before which there is none.
+    """Distance of the first root of the gap f(t) = z − h at or beyond ``start_m``, which has none before it.
 
     |f'| is at most ``closing`` and |f''| at most ``curvature``, so a step of f / closing never jumps over a crest,
     nor does (f' + √(f'² + 2 curvature f)) / curvature, which is tried too where the ground is rough. Where
@@ -151,14 +152,14 @@ def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
         t += step
         if t > max_range_m or t < 0.0:
             return np.inf
-        if left < 1e-9:  # meters that the step may have left to go
+        if left < 1e-9:  # bound of the remaining error, meters
             return t
     return np.inf
 
 
 @njit(inline="always")
 def _steepest(dx, dy, dz, ground):
-    """Bounds of the speed at which a ray and the ground approach each other, and of its derivative."""
+    """Upper bounds of the speed at which a ray and the ground approach each other, and of its derivative."""
     slope_x, slope_y = ground[1] * ground[2], ground[4] * ground[5]
     closing = abs(slope_x * dx) + abs(slope_y * dy) - dz
     curvature = abs(slope_x * ground[2]) + abs(slope_y * ground[5])

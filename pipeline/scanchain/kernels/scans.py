@@ -1,4 +1,4 @@
-"""Preprocessing of a scan: valid points, one of each voxel, deskewed."""
+"""Preprocessing of a scan: valid points, one per voxel, deskewed."""
 
 import math
 
@@ -8,20 +8,20 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import perturb
 from scanchain.kernels.voxels import EMPTY, find, first_slot, pack
 
-_MOST_STEPS = 100.0  # of 1 rad in a sweep; no lidar turns faster
-_TERMS = 9  # of series in the square of an angle up to 1 rad
+_MOST_STEPS = 100.0  # of 1 rad per sweep; no lidar turns faster
+_TERMS = 9  # of the power series in the squared angle, up to 1 rad
 _INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(2 * _TERMS + 3))
-_BLOCK = 2048  # points whose keys are computed at once, which the compiler makes vector instructions of
+_BLOCK = 2048  # points whose keys are computed together, in a loop that the compiler vectorizes
 
 
 @njit(nogil=True)
 def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, table, chosen):
-    """Fill ``chosen`` with the indices of the first point in each voxel, near and far points left out.
+    """Fill ``chosen`` with the indices of the first point in each voxel, without near and far points.
 
     points : (N, d) meters from the lidar
-    table : int64, a power of two of slots, whatever they hold; chosen : int32, half as many
-    Returns how many were chosen, −1 where there was no room for all; for 2 N slots there is.
-    Neighbors on a ring mostly share a voxel, so the last key is tried before the table.
+    table : int64, a power of two of slots, with any contents; chosen : int32, half as many
+    Returns the number chosen, −1 where there was not enough room; 2 N slots always suffice.
+    Neighbors on a ring mostly share a voxel, so the last key is compared before the table is probed.
     """
     n, slots = points.shape[0], table.size
     table.fill(EMPTY)
@@ -37,7 +37,7 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
             keys[tried], rows[tried] = key, start + i
             tried += (key != last) & (key != EMPTY)
             last = key
-        for k in range(tried):  # without a branch on what was read: the processor waits for many slots at once
+        for k in range(tried):  # without branches on values read, so that the cache misses overlap
             held[k] = table[first_slot(slots, keys[k])]
         for k in range(tried):
             if held[k] == keys[k]:
@@ -56,7 +56,7 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
 def _keys(points, scale: float, low: float, high: float, keys):
     """Write the key of each point's voxel, EMPTY for squared ranges below low or above high.
 
-    Coordinates a fixed step apart are read as vectors; the compiler does not know how long a row of ``points`` is.
+    Reads at a fixed stride are vectorized; the compiler does not know the row length of ``points``.
     """
     flat = points.reshape(-1)
     if points.shape[1] == 2:
@@ -100,7 +100,7 @@ def deskew_in_plane(points, shares, twist):
 
 @njit(nogil=True)
 def deskew_in_space(points, shares, twist):
-    """``deskew_in_plane`` of points (N, 3) with a twist (6,): Rodrigues' formula (Barfoot 2017, 7.86) in vectors.
+    """``deskew_in_plane`` for points (N, 3) and a twist (6,): Rodrigues' formula (Barfoot 2017, 7.86) on vectors.
 
     exp(τ ξ) p = p + τ ρ + φ × (a τ p + b τ² ρ + φ × (b τ² p + c τ³ ρ)) with ξ = (ρ, φ), θ = τ |φ| and the series
     a = Σ (−θ²)ⁿ/(2n+1)!, b = Σ (−θ²)ⁿ/(2n+2)!, c = Σ (−θ²)ⁿ/(2n+3)!. A turn of more than 1 rad is taken in steps.
@@ -150,9 +150,9 @@ def _series(s: float, first: int) -> float:
 def keep_valid(x, y, z, low_square: float, high_square: float, points, kept):
     """Copy the points whose squared range is finite, above low_square and at most high_square, in their order.
 
-    x, y, z : (N,) float32 meters, strided as the records are
-    points : (N, 3) float32, filled from the front; kept : (N,) int32, the place of each in the cloud
-    Returns how many were kept. NaN fails both comparisons.
+    x, y, z : (N,) float32 meters, with the stride of the records
+    points : (N, 3) float32, filled from the front; kept : (N,) int32, the index of each in the cloud
+    Returns the number kept. NaN fails both comparisons.
     """
     count = 0
     for i in range(x.size):

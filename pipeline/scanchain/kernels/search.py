@@ -1,8 +1,8 @@
-"""Best poses of points of the plane in a grid of scores, by branch and bound (Hess et al. 2016).
+"""Best poses of planar points in a grid of scores, by branch and bound (Hess et al. 2016).
 
-A window is 2ʰ × 2ʰ shifts of the points under one heading: (−bound, level h, turn, column, row). It scores at most
-what its points find in level h of the grid's pyramid, so the window with the highest bound is split until one of a
-single shift comes first: nothing that is left can beat it.
+A window is 2ʰ × 2ʰ shifts of the points under one heading: (−bound, level h, turn, column, row). Its score is at
+most that of its points in level h of the grid's pyramid. The window with the highest bound is split until one of a
+single shift comes first: no remaining one can beat it.
 """
 
 import heapq
@@ -14,24 +14,24 @@ from scanchain.kernels.compiling import njit
 
 SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2  # score of a point in a cell
 APART_RAD = 0.1  # least angle between two distinct poses
-_EARLY = 32  # points between two tests whether the rest can still reach the least score
-TURNS = 3  # headings that are scored at once: a cell more on each side is what one at the median range moves by
+_EARLY = 32  # points between two checks whether the rest can still reach the least score
+TURNS = 3  # headings scored together: a point at the median range moves by one cell from one to the next
 
 
 @njit(nogil=True)
 def score_windows(blocks, pyramid, room, has_room, spans, cells, first: int, least: float, rival: float, reached):
-    """The largest windows whose bound is worth it, under some headings: (K, 5).
+    """The largest windows whose bound reaches the limit, under some headings: (K, 5).
 
-    Only where the points under a heading score enough in wider windows are its own and those beside it scored.
+    One heading is scored in wider windows; only where it scores enough are it and its neighbors scored.
 
     blocks : (2ˡ, 2ˡ, rows, columns) of the best score in windows of the pyramid's last level l and one cell around
-        them, by their place in its 2ˡ × 2ˡ blocks: points of one scan in neighboring windows lie side by side, and
-        many windows are scored at once
+        them, by position in its 2ˡ × 2ˡ blocks: scores of one point in neighboring windows are adjacent in memory,
+        and many windows are scored at once
     pyramid, room, least, rival : as in ``split_best``
-    has_room : (rows, columns) of windows, those that hold a shift which is searched
-    spans : (rows, 2) first of these in each row, and past the last
+    has_room : (rows, columns) whether a window contains a shift to search
+    spans : (rows, 2) the first such window in each row, and one past the last
     cells : (turns, N, 2) column and row of the points without a shift, under the headings from ``first`` on
-    reached : (1,) best score of a pose so far, of those in the best window of each heading; raised
+    reached : (1,) best score of a pose so far, among those in the best window of each heading; updated
     """
     level = pyramid.shape[0] - 1
     size, turns = 1 << level, cells.shape[0]
@@ -78,7 +78,7 @@ def _score_heading(blocks, level: int, has_room, spans, cells, scores):
 
 @njit(inline="always")
 def _best_of_window(layer, room, cells, first_row: int, first_column: int, size: int) -> int:
-    """Best score of the shifts of a window, 0 where there is none."""
+    """Best score of the shifts to search in a window, 0 where there is none."""
     best = 0
     for y in range(first_row, min(first_row + size, room.shape[0])):
         for x in range(first_column, min(first_column + size, room.shape[1])):
@@ -92,19 +92,19 @@ def split_best(
     pyramid, room, cells, sorted_windows, split, windows, found, turn_rad: float, least: float, rival: float,
     apart: float, steps: int,
 ):  # fmt: skip
-    """Split the most promising windows, at most so many; the split ones of which may still hold a pose (K, 5).
+    """Split the most promising windows, at most ``steps``; returns those that may still contain a pose (K, 5).
 
-    The search is over once none is left of these or of the sorted ones.
+    The search is complete once none of these and of the sorted ones is left.
 
     pyramid : (levels, rows, columns), level h the best score in the 2ʰ × 2ʰ cells that start at each cell
-    room : (rows, columns) of shifts that are searched
-    cells : (turns, N, 2) as in ``score_windows``, points in random order: poor windows are given up after a few
-    sorted_windows : (K, 5) of ``score_windows``, the best first; split : (2,) how many were taken, and the
-        number of poses found; changed
+    room : (rows, columns) whether to search a shift
+    cells : (turns, N, 2) as in ``score_windows``, points in random order: poor windows are rejected after a few
+    sorted_windows : (K, 5) of ``score_windows``, the best first; split : (2,) number of them processed, and of
+        poses found; updated
     windows : (K, 5) of the last call, a heap
-    found : (A, 4) column, row, turn and score of the poses found, each so many cells or APART_RAD away from those
-        before it, the best first; filled
-    least : score below which nothing counts; rival : share of the best score, likewise
+    found : (A, 4) column, row, turn and score of the poses found, the best first, each ``apart`` cells or
+        APART_RAD away from those before it; filled
+    least : smallest score of a pose; rival : smallest score as a share of the best one
     """
     heap = [(w[0], w[1], w[2], w[3], w[4]) for w in windows]
     size = len(sorted_windows)
@@ -137,7 +137,7 @@ def split_best(
 
 @njit(inline="always")
 def _split(heap, pyramid, room, cells, level: int, turn: int, x: int, y: int, least: float):
-    """Push those of the four windows of the next level that make up one which reach the least score."""
+    """Push those of the four sub-windows of the next level whose bound reaches the least score."""
     half = 1 << level
     for far_y in (y, y + half):
         for far_x in (x, x + half):
@@ -172,7 +172,7 @@ def _is_taken(found, level: int, turn: int, x: int, y: int, turn_rad: float, apa
 
 @njit(inline="always")
 def _score(layer, cells, x: int, y: int, least: float) -> int:
-    """Score of the points, shifted by so many cells, in a layer; given up once the rest cannot reach the least."""
+    """Score in a layer of the points shifted by (x, y) cells; aborted once the rest cannot reach the least."""
     count = cells.shape[0]
     total = 0
     for i in range(count):
@@ -186,7 +186,7 @@ def _score(layer, cells, x: int, y: int, least: float) -> int:
 
 @njit(nogil=True)
 def climb(cells, points, origin, resolution_m: float, pose, step_rad: float):
-    """Move a pose (x, y, yaw), in place, uphill on the score of its points; returns their mean score.
+    """Move a pose (x, y, yaw), in place, to a local maximum of its points' mean score, which is returned.
 
     Steps are half a cell and ``step_rad``, then half as large.
     """

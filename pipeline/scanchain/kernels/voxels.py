@@ -1,11 +1,11 @@
 """A hash map of voxels with running moments of their points and the local shape fitted to them.
 
 A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's center, so
-that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
-(3), direction (3), shape; of a line or plane the variance across it; and of a plane in space its second
-direction (3), and how that variance carries over to the fit: at the mean, and by squared distance along both
-directions. Its row of ``history`` holds the ticks of the first and of the last insertion, and the number of points
-when the shape was fitted. A 2D map is the plane z = 0 of the same layout.
+that no precision is lost far from the origin. Its row of ``cells`` holds what matching reads, in two cache lines:
+mean (3), direction (3), shape; for a line or plane the variance across it; and for a plane in space its second
+direction (3), and the factors from that variance to the variance of the fit: at the mean, and per squared distance
+along both directions. Its row of ``history`` holds the ticks of the first and of the last insertion, and the
+number of points when the shape was fitted. A 2D map is the plane z = 0 of the same layout.
 """
 
 from typing import NamedTuple
@@ -19,17 +19,17 @@ from scanchain.kernels.matrices import eigenvalues_3d, eigenvector_3d, normal_2d
 EMPTY = np.int64(-1)  # no key
 _OFFSET = 1 << 20
 _LIMIT = (1 << 21) - 1
-REACH = float(_OFFSET - 64)  # voxels around any point of the space, within which no two have one key
+REACH = float(_OFFSET - 64)  # voxels around any point, within which keys are unique
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
 DIRECTION, SHAPE, THICKNESS, ACROSS = 3, 6, 7, 8
 MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
 CELL = 16  # two more than are used, to fill the second cache line
 BORN, SEEN, FITTED = 0, 1, 2
-_GROWN = 1.3  # factor by which the points of a voxel grow until it is fitted again
-_FILLED = 2.5  # standard deviations of a range in a voxel whose mean is off a surface by as much as its points are
-_BROAD = 0.125  # least width, in voxels, of a plane that is fitted to a voxel's own points
+_GROWN = 1.3  # factor by which the points of a voxel must grow to refit it
+_FILLED = 2.5  # voxel size, in σ of a range, at which the mean is as far off the surface as the points
+_BROAD = 0.125  # least width, in voxels, of a plane fitted to a voxel's own points alone
 _BLOCK = 256  # points whose voxels are looked up together
-MANY = 30.0  # number of points beyond which more add no information, as their poses share errors
+MANY = 30.0  # number of points above which more add no information, since their poses share errors
 
 
 class Voxels(NamedTuple):
@@ -50,11 +50,11 @@ class Voxels(NamedTuple):
 
 @njit(nogil=True)
 def insert(voxels, points, T, tick: int, alone: float, variance: float):
-    """Add points (N, d), moved by T into the map's frame, and refit the voxels that have grown by enough.
+    """Add points (N, d), moved by T into the map's frame, and refit the voxels that have grown enough.
 
-    alone : points from which on a voxel is fitted without its neighbors
-    variance : σ² of the points, m², that shapes are cleared of; 0 where it is small against the voxels
-    Room for N more voxels must be there.
+    alone : number of points at which a voxel is fitted without its neighbors
+    variance : σ² of the points, m², that is subtracted from shapes; 0 where it is small against the voxels
+    There must be room for N more voxels.
     """
     touched = np.empty(points.shape[0], np.int32)
     sums = np.empty(10)
@@ -88,7 +88,7 @@ def insert(voxels, points, T, tick: int, alone: float, variance: float):
 def _locate(voxels, points, T, moved, keys, rows):
     """Points moved by T, keys of their voxels, and rows of those found in the first slot of the table, else −1.
 
-    Without a branch on what was read, the processor waits for many slots at once.
+    Without branches on values read, so that the cache misses overlap.
     """
     scale = 1.0 / voxels.size_m
     for i in range(points.shape[0]):
@@ -120,7 +120,7 @@ def move(T, points, i: int):
 def shape_of(cells, voxel: int):
     """Shape of a voxel, its mean and its direction.
 
-    As numbers: where a function takes a row of ``cells``, references to it are counted at every point.
+    Returned as numbers: passing a row of ``cells`` would cost reference counting at every point.
     """
     q = cells[voxel, 0], cells[voxel, 1], cells[voxel, 2]
     normal = cells[voxel, DIRECTION], cells[voxel, DIRECTION + 1], cells[voxel, DIRECTION + 2]
@@ -143,7 +143,7 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
 
 @njit(inline="always")
 def _copy_row(to, row: int, source, other: int):
-    """Copy one row, number by number: half the time of a slice, whose references are counted."""
+    """Copy one row element by element: takes half the time of a slice, whose references are counted."""
     for k in range(source.shape[1]):
         to[row, k] = source[other, k]
 
@@ -190,11 +190,11 @@ def covariance_of(m):
 
 @njit(nogil=True)
 def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums):
-    """Mean of the voxel's own points; shape and direction from them, or from the neighbors' too.
+    """Fit the mean of the voxel's own points, and shape and direction of these or of the neighbors' too.
 
-    The neighbors help where the points are few or show no width: a ring that passes again and again while the
-    lidar stands still leaves many points and no surface. Where points are noisy, the mean moves to the plane of
-    all, by the share of its own variance (σ²/n, more where noise fills the voxel) in that and the roughness.
+    The neighbors are included where the points are few or have no width: a ring that is measured repeatedly while
+    the lidar stands still gives many points and no surface. Where points are noisy, the mean moves towards the
+    plane of all by v / (v + r): v the mean's variance (σ²/n, more where noise fills the voxel), r the roughness.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
     m, cell, size = voxels.moments[voxel], voxels.cells[voxel], voxels.size_m
@@ -220,7 +220,7 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums
 
 @njit(inline="always")
 def _fit_shape(m, dimension: int, noise: float, cell) -> float:
-    """Shape and direction of the points with the moments m (10,); returns the least variance within that, m²."""
+    """Shape and direction of the points with the moments m (10,); returns its least variance within it, m²."""
     return _fit_2d(m, noise, cell) if dimension == 2 else _fit_3d(m, noise, cell)
 
 
@@ -270,8 +270,8 @@ def _fit_2d(m, noise: float, cell):
 def _fit_3d(m, noise: float, cell):
     """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance, less the noise in each.
 
-    A plane is thin against its second extent, a line is thin against its length in both others. Of points on one
-    line, rounding makes the first two negative.
+    A plane is thin relative to its second extent, a line relative to its length in both others. For points on one
+    line, rounding can make the first two negative.
     """
     cell[SHAPE] = POINT
     n = m[0]
@@ -308,7 +308,7 @@ def pack(ix: int, iy: int, iz: int) -> int:
 
 @njit(inline="always")
 def key_of(x: float, y: float, z: float, scale: float) -> int:
-    """Key of the voxel that holds a point; scale : voxels a meter."""
+    """Key of the voxel that holds a point; scale : voxels per meter."""
     return pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
 
 
@@ -335,7 +335,7 @@ def find(keys, key: int):
 def find_row(rows, keys, key: int) -> int:
     """Row of ``keys`` (V,) that holds the key, or ~slot (negative) of the empty slot where that row belongs.
 
-    rows : (S,) int32, −1 where a slot is empty; much smaller than slots that hold keys, for fast probing
+    rows : (S,) int32, −1 where a slot is empty; much smaller than a table of the keys, for fast probing
     """
     slot = first_slot(rows.size, key)
     while True:

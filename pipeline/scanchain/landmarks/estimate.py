@@ -37,7 +37,7 @@ def of_relative_positions(measurements: Measurements) -> Values:
 
 
 def disturbed(state: Values, shift_m: float, turn_rad: float) -> Values:
-    """The poses but for the first moved by a shift along both axes and turned about the origin."""
+    """The state with all poses except the first turned about the origin and shifted along both axes."""
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     poses = state.poses.copy()
     poses[1:, :2] = poses[1:, :2] @ np.array([[c, s], [-s, c]]) + shift_m
@@ -46,10 +46,10 @@ def disturbed(state: Values, shift_m: float, turn_rad: float) -> Values:
 
 
 def growing(measurements: Measurements, solver: LinearSolver) -> Values:
-    """Initialize part by part: extend the solution of the log so far, optimize, and so on to its end.
+    """Initial values by incremental optimization: the solution so far is extended and optimized, up to the end.
 
-    Dead reckoning over the whole log may be meters off, where a robust loss finds but a local minimum; over a
-    half of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
+    Dead reckoning over the whole log may be meters off, so that a robust loss finds only a local minimum; over the
+    second half of a part, from optimized poses and landmarks, it is not. The loss is convex in the residuals.
     """
     count = len(measurements.motion) + 1
     poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)
@@ -73,7 +73,7 @@ def growing(measurements: Measurements, solver: LinearSolver) -> Values:
 
 
 def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, NDArray[np.int64]]:
-    """The problem of the first so many poses, and the landmarks observed from them."""
+    """The problem of the first ``poses`` poses, and the landmarks observed from them."""
     kept = measurements.observed[:, 0] < poses
     known, landmark = np.unique(measurements.observed[kept, 1], return_inverse=True)
     part = replace(
@@ -102,7 +102,7 @@ def _relative(measurements: Measurements, poses: Matrix) -> Matrix:
 
 
 def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
-    """Poses (K, 3) that follow each other by these motions (K − 1, 3), the first being ``start``."""
+    """Poses (K, 3) chained by these motions (K − 1, 3) from ``start``, the first pose."""
     poses = np.tile(start, (len(motion) + 1, 1))
     poses[1:, 2] += np.cumsum(motion[:, 2])
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
@@ -112,24 +112,24 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
 
 
 _FREEDOM = 4.0
-_SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)
+_SCALE2 = _FREEDOM + 2.0  # up to a factor absorbed by σ, the weight (ν + 2) / (ν + χ²) is s² / (s² + χ²)
 
 
 @dataclass(frozen=True, slots=True)
 class StudentLoss:
-    """ρ(χ²) of a bearing and a range together, ν = 4, times the share of the observation.
+    """Student's t loss ρ(χ²) of a bearing and a range jointly, ν = 4, times the share of the observation.
 
-    share : (N,) of an independent observation, above 0 up to 1
+    share : (N,) weight as a share of that of an independent observation, above 0 up to 1
     """
 
     share: NDArray[np.float64]
 
     def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Up to the share, (N,)."""
+        """Weight from 0 to the share, (N,)."""
         return self.share * _SCALE2 / (_SCALE2 + chi2)
 
     def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The share of χ² near zero, (N,)."""
+        """Loss, which is the share times χ² near zero, (N,)."""
         return self.share * _SCALE2 * np.log1p(chi2 / _SCALE2)
 
 
@@ -164,10 +164,10 @@ def minimize(
     tolerance: float = 1e-10,
     first_damping: float = 1e-4,
 ) -> Minimum:
-    """Follow the residuals downhill from the guess; a linearized step at a time, each solved by ``solver``.
+    """Minimum by descent from the guess, one linearized step at a time, each solved by ``solver``.
 
-    It ends as ``descend`` does. The first damping is for a guess that may be poor; near the minimum 1e-10
-    serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
+    It ends as ``descend`` does. The default of the first damping is for a guess that may be poor; near the minimum
+    1e-10 is better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
     """
 
     def evaluate(state: Values) -> Evaluation:

@@ -1,4 +1,4 @@
-"""Files of landmark problems: npz of the course and folders of MRCLAM in."""
+"""Reading of landmark problems: npz files of the course and MRCLAM folders."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _SHAPES = {
     "sigma_landmark": "(2, 2)",
 }
 _LARGEST = 9e9  # seconds above which a time does not fit 64 bits of nanoseconds
-_TRUTH = ("gt_traj", "gt_landmarks")  # what a problem need not have
+_TRUTH = ("gt_traj", "gt_landmarks")  # arrays that a problem may lack
 
 
 def read_landmark_data(path: Path) -> LandmarkData:
-    """Read a problem; raises InputError for whatever is wrong with the file, pickled objects included.
+    """Read a problem; raises InputError for anything wrong with the file, including pickled objects.
 
-    The file does not state whether its observations are relative positions or bearings and ranges: the one that
-    the true positions fit better is taken, or that agree better with each other where the file has no truth.
+    The file does not state whether its observations are relative positions or bearings and ranges. The kind that
+    fits the true positions better is assumed, or without truth the kind whose observations agree better.
     """
     arrays = _read(path)
     odometry, table = arrays["odom"], arrays["observations"]
@@ -45,7 +45,7 @@ def read_landmark_data(path: Path) -> LandmarkData:
     if len(unseen):
         raise InputError(
             f"{path}: {len(unseen)} of {counted(len(landmarks), 'landmark')} are not observed, the first is "
-            f"{unseen[0]}; add observations of them, or leave them out and number the others on"
+            f"{unseen[0]}; add observations of them, or remove them and renumber the others"
         )
     reckoned = np.cumsum(np.vstack([np.zeros(2), odometry]), axis=0)
     kind = _kind(path, poses if len(poses) else reckoned, landmarks, observed, table[:, 2:])
@@ -124,8 +124,8 @@ def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
 def _kind(path: Path, poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
     """Kind of the measurements: least median distance of the measured points from the landmarks.
 
-    A landmark that is not known (NaN) lies at the median of its measured points. Raises InputError where the
-    points fit bearings in degrees best, and where nothing tells.
+    An unknown landmark (NaN) is placed at the median of its measured points. Raises InputError if the points fit
+    bearings in degrees best, and if the kind cannot be determined.
     """
     bearing, reach = measured.T
     polar, by_degrees = (
@@ -141,8 +141,8 @@ def _kind(path: Path, poses: Matrix, landmarks: Matrix, observed: NDArray[np.int
         raise InputError(f"{path}: bearings of observations reach {largest:.6g}: degrees? give radians")
     if not np.isfinite(landmarks).all() and len(np.unique(observed[:, 1])) == len(observed):
         raise InputError(
-            f"{path}: no landmark is observed twice and there is no gt_landmarks, so that nothing tells relative "
-            "positions from bearings and ranges; add observations, or gt_landmarks"
+            f"{path}: no landmark is observed twice and there is no gt_landmarks, so that relative positions "
+            "and bearings with ranges cannot be distinguished; add observations, or gt_landmarks"
         )
     return "linear" if as_linear <= as_polar else "bearing-range"
 
@@ -166,7 +166,7 @@ class RangeLog:
     name : of the folder and the robot
     times_s, velocities : (M,), (M, 2) wheel odometry: forward in m/s, turning in rad/s, whenever either changes
     seen_s, subjects, measured : (N,), (N,) landmark subjects, (N, 2) bearing in rad and range in m
-    of_robots, unknown : observations left out: of other robots, and of barcodes that no subject has
+    of_robots, unknown : observations left out: of other robots, and of barcodes without a subject
     outside : observations left out since no odometry was logged at their time
     true_s, true_poses : (T,), (T, 3) motion capture x, y, heading; empty where the folder has none
     true_subjects, true_landmarks : (L,), (L, 2) surveyed landmarks; empty where the folder has none
@@ -188,7 +188,7 @@ class RangeLog:
 
 
 def read_mrclam(folder: Path, robot: int) -> RangeLog:
-    """Log of robot ``robot``; raises InputError for whatever is missing or wrong."""
+    """Log of robot ``robot``; raises InputError for anything missing or wrong."""
     if not (folder / "Barcodes.dat").is_file():
         raise InputError(
             f"{folder}: is no MRCLAM folder (Barcodes.dat is missing); name an npz file or such a folder"
@@ -244,9 +244,9 @@ def _numbers(path: Path, columns: int) -> Matrix:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); an MRCLAM folder needs it") from None
     except ValueError as error:
-        raise InputError(f"{path}: is no table of {columns} numbers a line ({error}); check the file") from None
+        raise InputError(f"{path}: is no table of {columns} numbers per line ({error}); check the file") from None
     if not table.size or table.shape[1] != columns:
-        raise InputError(f"{path}: is empty or has no {columns} numbers a line; check the file")
+        raise InputError(f"{path}: is empty or does not have {columns} numbers per line; check the file")
     if not (np.abs(table) < _LARGEST).all():
         row = int(np.flatnonzero(~(np.abs(table) < _LARGEST).all(axis=1))[0])
         raise InputError(f"{path}: row {row + 1} is not finite, or reaches {_LARGEST:g}; correct or remove it")

@@ -37,7 +37,7 @@ class LandmarkData:
 class Values:
     """An estimate: poses (K, 2) x, y or (K, 3) x, y, heading, landmarks (L, 2); m, rad.
 
-    ``calibration`` (C,) are unknowns of the robot itself, none for a file.
+    ``calibration`` (C,) are calibration unknowns of the robot, none for a file.
     """
 
     poses: Matrix
@@ -46,11 +46,11 @@ class Values:
 
     @property
     def unknowns(self) -> NDArray[np.float64]:
-        """All in one, poses first, landmarks last, (n,)."""
+        """All unknowns in one vector (n,): poses, calibration, landmarks."""
         return np.concatenate([self.poses.ravel(), self.calibration, self.landmarks.ravel()])
 
     def moved(self, step: NDArray[np.float64]) -> Values:
-        """The values a step (n,) away, poses first, landmarks last."""
+        """The values after a step (n,), in the order of ``unknowns``."""
         poses, calibration, landmarks = np.split(step, np.cumsum([self.poses.size, self.calibration.size]))
         return Values(
             self.poses + poses.reshape(self.poses.shape),
@@ -59,7 +59,7 @@ class Values:
         )
 
 
-FIRST_SHARE = 0.01  # noise of the first pose as a share of a step's
+FIRST_SHARE = 0.01  # standard deviation of the first pose as a share of a step's
 _COMPONENTS = ("x", "y", "heading")
 
 
@@ -70,7 +70,7 @@ class Layout:
     poses : how many
     pose_size : unknowns of a pose, 2 (x, y) or 3 (x, y, heading)
     landmarks : (L,) their names, as numbers
-    calibration : names of the unknowns that are the robot's own
+    calibration : names of the calibration unknowns
     """
 
     poses: int
@@ -80,12 +80,12 @@ class Layout:
 
     @property
     def split(self) -> int:
-        """Columns of the poses; all others come after."""
+        """Number of columns of the poses, which come before all others."""
         return self.poses * self.pose_size
 
     @property
     def bandwidth(self) -> int:
-        """Largest distance of two columns of poses in one row: odometry joins each to the next, nothing else."""
+        """Largest distance between two columns of poses in one row: odometry joins successive poses only."""
         return 2 * self.pose_size - 1
 
     @property
@@ -113,7 +113,7 @@ class Layout:
 class Pattern:
     """Entries of A that may be nonzero, row by row: columns of row r are columns[row_start[r] : row_start[r + 1]].
 
-    One object is one pattern: solvers reuse their analysis of it as long as they are given the same one.
+    Patterns are compared by identity: solvers reuse their analysis as long as they are given the same object.
     """
 
     row_start: NDArray[np.int64]
@@ -152,7 +152,7 @@ def whitening(covariance: Matrix) -> Matrix:
 
 
 def pattern_of(groups: list[NDArray[np.int64]], layout: Layout) -> Pattern:
-    """One group of rows, (rows, entries) columns each, under the other."""
+    """Pattern of groups of rows, one below the other; a group holds the columns (rows, entries) of its entries."""
     lengths = np.concatenate([np.full(len(group), group.shape[1], np.int64) for group in groups])
     row_start = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)])
     return Pattern(row_start, np.concatenate([group.reshape(-1) for group in groups]), layout)
@@ -187,8 +187,8 @@ def _differences(
 def linear_system(given: Measurements) -> LinearSystem:
     """A x = b with A = Σ^(−1/2) H, b = Σ^(−1/2) z: a prior on the first pose, odometry, observations.
 
-    The prior puts the first pose at the origin. It can be met exactly, so that its weight, a hundredth of a step's
-    noise, matters to the covariance alone.
+    The prior puts the first pose at the origin. It can be satisfied exactly, so that its noise, a hundredth of a
+    step's, affects only the covariance.
     """
     layout = Layout(len(given.motion) + 1, 2, given.landmarks)
     W_odometry, W_observation = whitening(given.motion_covariance[0]), whitening(given.measured_covariance)
@@ -222,8 +222,8 @@ class Linearization:
 class Calibration:
     """Unknowns common to all motions of the robot.
 
-    names : (C,) what they are called
-    value : (C,) at which the motions were worked out; slope (K − 1, p, C) by how much they change with them
+    names : (C,) of the unknowns
+    value : (C,) at which the motions were computed; slope (K − 1, p, C) their derivative by the unknowns
     sigma : (C,) prior about zero
     """
 
@@ -247,7 +247,7 @@ class Measurements:
         of the former, without in the world's
     calibration : errors common to all motions
     observed : (N, 2) pose, landmark
-    measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; of every one alike
+    measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; one covariance for all
     landmarks : (L,) their names, as numbers
     """
 
@@ -265,7 +265,7 @@ class Measurements:
 class BearingRangeProblem:
     """Prior on the first pose, motion from pose to pose, bearings and ranges.
 
-    ``motion_columns`` (K − 1, 2 p + C) and ``observation_columns`` (N, p + 2) are the unknowns of each of them,
+    ``motion_columns`` (K − 1, 2 p + C) and ``observation_columns`` (N, p + 2) are the columns of their unknowns,
     ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
     """
 
@@ -323,6 +323,6 @@ class BearingRangeProblem:
         return LinearSystem(self.pattern, values, b)
 
     def damped(self, system: LinearSystem, damping: NDArray[np.float64]) -> LinearSystem:
-        """The system with a row √d of its own for every unknown, so that AᵀA grows by diag(d); d (n,)."""
+        """The system with an additional row √d for every unknown, so that AᵀA grows by diag(d); d (n,)."""
         values, b = np.concatenate([system.values, np.sqrt(damping)]), np.append(system.b, np.zeros(len(damping)))
         return LinearSystem(self._damped, values, b)

@@ -1,4 +1,4 @@
-"""A log of wheel velocities, ranges and bearings to trajectory and landmarks, and to the noise of either."""
+"""Trajectory, landmarks and noise estimated from a log of wheel velocities, ranges and bearings."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from scanchain.landmarks.files import RangeLog
 from scanchain.landmarks.problem import BearingRangeProblem, Calibration, Measurements, Values
 from scanchain.landmarks.solvers import ESTIMATOR, Covariance, create_solver
 
-_AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot moves
-_LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible
+_AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² per second, whether or not the robot moves
+_LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion of zero duration invertible
 
 OWN = ("forward scale", "forward lost in turning", "turn scale", "drift", "delay")
 OWN_UNITS = ("", " m/rad", "", " rad/m", " s")
 _SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # typical of differential drives; the units as above
-_STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # over which the slopes are taken
+_STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # steps of the finite differences
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryNoise:
     """White noise of a robot's wheels: standard deviations of its motion after a meter, and after a radian turned.
 
-    It grows with the root of either. The values at hand are of a small differential drive on a smooth floor.
+    They grow with the square root of either. The defaults are for a small differential drive on a smooth floor.
     """
 
     forward_m: float = 0.03
@@ -45,10 +45,10 @@ class OdometryNoise:
 
 @dataclass(frozen=True, slots=True)
 class Reckoning:
-    """The log cut at its observations.
+    """Dead-reckoned motions between the observations of a log.
 
     motion : (K − 1, 3) from each node to the next, in the frame of the former
-    sources, rest : (K − 1, 4, 3, 3), (K − 1, 3, 3) its covariance by each noise of unit density, and by none
+    sources, rest : (K − 1, 4, 3, 3), (K − 1, 3, 3) its covariance by each source of unit density, and the rest
     calibration : errors of the robot's velocities, and the motion's Jacobian
     """
 
@@ -58,12 +58,12 @@ class Reckoning:
     calibration: Calibration
 
     def covariance(self, densities: NDArray[np.float64]) -> Matrix:
-        """Of every motion, (K − 1, 3, 3)."""
+        """Covariance of every motion, (K − 1, 3, 3)."""
         return np.einsum("c,kcab->kab", densities, self.sources) + self.rest
 
 
 def reckon(log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64]) -> Reckoning:
-    """Integrate the velocities from one node (K,) to the next, corrected by ``own`` (5,).
+    """Motions by integration of the velocities, corrected by ``own`` (5,), from one node (K,) to the next.
 
     With (v, ω) as logged and c as ``own``, the robot drives, a delay c₄ later, at
         (1 + c₀) v + c₁ |ω|   and   (1 + c₂) ω + c₃ v.
@@ -80,7 +80,7 @@ def reckon(log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64]
 def _integrated(
     log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64], *, sources: int
 ) -> tuple[Matrix, Matrix]:
-    """Motions (K − 1, 3) and their Jacobians by so many sources of noise (K − 1, sources, 3, 3)."""
+    """Motions (K − 1, 3) and their covariances by each noise source of unit density, (K − 1, sources, 3, 3)."""
     v, turn_rate = log.velocities.T
     driven = np.stack(
         [(1.0 + own[0]) * v + own[1] * np.abs(turn_rate), (1.0 + own[2]) * turn_rate + own[3] * v], axis=1
@@ -91,19 +91,19 @@ def _integrated(
     return motion, spread
 
 
-_LAGS_S = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])  # edges; farther apart errors count as independent
+_LAGS_S = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])  # bin edges; errors farther apart count as independent
 _FEWEST = 30  # least number of pairs from which a correlation is estimated
-_STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that the stated noise counts as
+_STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that the prior noise counts as
 _LEAST_REDUNDANCY = 0.05  # least redundancy as a share of the sightings
 
 
 class SightingPairs:
-    """Pairs of sightings of one landmark within some seconds of each other, found once."""
+    """Pairs of sightings of one landmark within some seconds of each other, computed once."""
 
     def __init__(self, seen_s: NDArray[np.float64], landmarks: NDArray[np.int64]) -> None:
         """Times and landmarks of the sightings, (N,) each."""
         since = seen_s - seen_s.min(initial=np.inf)
-        key = since + landmarks * (since.max(initial=0.0) + 2.0 * _LAGS_S[-1])  # a landmark's time is its own
+        key = since + landmarks * (since.max(initial=0.0) + 2.0 * _LAGS_S[-1])  # disjoint for landmarks
         order = np.argsort(key, kind="stable")
         places = np.arange(len(key))
         after = np.searchsorted(key[order], key[order] + _LAGS_S[-1]) - places - 1
@@ -123,19 +123,19 @@ class SightingPairs:
 
     def share(self, correlation: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weight of each sighting as a share of an independent one, (N,): 1 / Σ of correlations (Kish 1965)."""
-        alike = correlation[self._lag]
-        sums = np.bincount(self._first, alike, self._count) + np.bincount(self._second, alike, self._count)
+        shared = correlation[self._lag]
+        sums = np.bincount(self._first, shared, self._count) + np.bincount(self._second, shared, self._count)
         return (1.0 / (1.0 + sums)).astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """Consistency of an estimate's residuals with the noise it was found with.
+    """Consistency of an estimate's residuals with its noise model.
 
     motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
-    motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
+    motion_freedom, redundancy : degrees of freedom of these: observations minus those absorbed by the state
     sensor_freedom : the redundancy, at least a small share of the effective number of observations, (2,)
-    sources, sources_freedom : (4,) the parts of ``motion`` and of its freedom that are each source's
+    sources, sources_freedom : (4,) the parts of ``motion`` and of its degrees of freedom due to each source
     """
 
     motion: float
@@ -149,7 +149,7 @@ class Consistency:
     def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
         """Factors by which the variances, those of odometry first, should grow, (6,); one where they are right.
 
-        stated : (6,) what they were thought to be beforehand, in units of what they are now
+        stated : (6,) their prior values, in units of the present ones
         """
         chi2 = np.concatenate([self.sources, self.sensor])
         freedom = np.concatenate([self.sources_freedom, self.sensor_freedom])
@@ -166,8 +166,8 @@ def consistency(
     """Compare residuals with their expectation under the noise model.
 
     With r a whitened motion, W its whitening, H = J C Jᵀ its leverage and V = Σ Vₛ its covariance by sources, the
-    part of source s is rᵀ(W Vₛ Wᵀ)r, and tr(W Vₛ Wᵀ(I − H)) its expectation (Harville 1977). Of observations,
-    weighed by w, of which ``share`` (N,) is what an independent one would count, they are Σ w r² and
+    part of source s is rᵀ(W Vₛ Wᵀ)r, and tr(W Vₛ Wᵀ(I − H)) its expectation (Harville 1977). For observations
+    with weights w, each counting as the share ``share`` (N,) of an independent one, they are Σ w r² and
     Σ share − w h (Lange et al. 1989).
 
     sources : (K − 1, 4, 3, 3) covariance of every motion by sources
@@ -190,12 +190,12 @@ def consistency(
     )
 
 
-_ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
-_SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the sensor's noise begins
-_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # of the odometry's, as OdometryNoise has them; rad, m
+_ANCHOR = 1e-8  # m², rad²: the first pose defines the world frame
+_SENSOR = np.square([0.03, 0.12])  # rad², m²; initial value of the sensor's noise
+_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # odometry as in OdometryNoise, sensor; rad, m
 _LEAST_FREEDOM = 1e-3  # least redundancy of the observations
-_TURNS, _CHANGE = 20, 0.1  # estimates of the noise, and the relative change that ends them
-_RECKONED = 2  # of them begin with a new dead reckoning, by the robot as it is known then
+_TURNS, _CHANGE = 20, 0.1  # largest number of noise estimates, and the relative change that ends them
+_RECKONED = 2  # number of these after which dead reckoning is repeated with the calibration found so far
 _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
 
 
@@ -204,13 +204,13 @@ class RangeSolution:
     """A minimum, the noise it was found for, and their consistency.
 
     nodes_s : (K,) times of the poses, those of the observations
-    reckoned : by the velocities as they were logged, every landmark where it was first seen
-    problem, guess, minimum : with the noise as estimated; where the first minimization began; where the last
-        ended, the first pose at the origin
-    variances : (6,) of the odometry's sources as ``OdometryNoise`` has them, of bearing and range
-    loss : with which the observations were weighed; with the share of each
+    reckoned : dead reckoning by the logged velocities, every landmark where it was first seen
+    problem, guess, minimum : problem with the estimated noise; initial guess of the first minimization; result of
+        the last one, with the first pose at the origin
+    variances : (6,) of the odometry's sources as in ``OdometryNoise``, of bearing and range
+    loss : loss of the observations, with the share of each
     covariance, consistency : at the minimum
-    iterations, time_s : steps after the guess; of the whole, reading left out
+    iterations, time_s : steps after the guess; total time, without reading
     """
 
     nodes_s: NDArray[np.float64]
@@ -234,12 +234,12 @@ class RangeSolution:
 def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution:
     """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
 
-    noise : of the odometry; None for an estimate of it
+    noise : of the odometry; None to estimate it
 
-    Bearings and ranges follow Student's t (``StudentLoss``); the scales of it and the variances of the odometry
-    are found by restricted maximum likelihood (``consistency``). Errors of one landmark's sightings are alike for
-    a while, by what the residuals show (``SightingPairs``): each sighting counts as a share of an independent one.
-    Raises InputError where the observations are too few for that.
+    Bearings and ranges follow Student's t (``StudentLoss``); its scales and the variances of the odometry are
+    found by restricted maximum likelihood (``consistency``). Errors of a landmark's successive sightings are
+    correlated, as estimated from the residuals (``SightingPairs``): each sighting counts as a share of an
+    independent one. Raises InputError if there are too few observations for that.
     """
     begin, solver = working_s(), create_solver(ESTIMATOR)
     nodes_s, node = np.unique(log.seen_s, return_inverse=True)

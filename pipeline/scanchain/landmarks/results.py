@@ -21,12 +21,12 @@ _FIGURES = ("method", "build_s", "factor_s", "solve_s", "again_s", "iterations")
 
 
 def file_stem(name: str) -> str:
-    """A name as the beginning of a file's name."""
+    """A name as a valid stem of a file name."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "problem"
 
 
 def table_of(study: Study) -> list[tuple[str, ...]]:
-    """Headings, then a row a method; a single one differs from none."""
+    """Headings, then one row per method; without the column of differences for a single method."""
     rows = [_HEADINGS, *(_row(method) for method in study.methods)]
     return rows if len(study.methods) > 1 else [row[:-1] for row in rows]
 
@@ -59,7 +59,7 @@ def size_of(study: Study) -> str:
     """Size of A as text."""
     rows, columns = study.system.pattern.shape
     entries = counted(len(study.system.values), "entry", "entries")
-    build = f"put together in {1e3 * study.build_s:.1f} ms"
+    build = f"assembled in {1e3 * study.build_s:.1f} ms"
     return f"{counted(rows, 'row')}, {counted(columns, 'column')}, {entries}, {build}"
 
 

@@ -1,4 +1,4 @@
-"""Linear solvers of A x = b by name, with their times and errors, and compared; marginal covariances."""
+"""Linear solvers of A x = b by name, comparison of their times and errors; marginal covariances."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Factor:
     """The triangular factor of a solution, or the inverse where there is none.
 
     name : such as "U of AᵀA" or "R of A"
-    matrix : (n, n) its rows and columns as the method ordered them; may hold zeros where it could have filled in
-    order : (n,) column of A at each place of that order
+    matrix : (n, n) with rows and columns in the order of the method; may hold explicit zeros of possible fill-in
+    order : (n,) column of A at each position of that order
     """
 
     name: str
@@ -44,16 +44,16 @@ class Factor:
 
 
 class Factored(NamedTuple):
-    """A factorization: ``solve`` gives x (n,), ``factor`` puts the factor together as a matrix."""
+    """A factorization: ``solve`` gives x (n,), ``factor`` assembles the factor as a matrix."""
 
     solve: Callable[[], NDArray[np.float64]]
     factor: Callable[[], Factor]
 
 
 class LinearSolver:
-    """Solves A x = b in the least-squares sense by one method, which keeps its analysis of the last pattern.
+    """Solves A x = b in the least-squares sense by one method, which reuses its analysis of the last pattern.
 
-    A method builds what it factorizes, AᵀA and Aᵀb or the order of A. Where A has not full column rank it raises
+    A method builds what it factorizes, AᵀA and Aᵀb or the order of A. If A lacks full column rank it raises
     SingularMatrixError or RuntimeError.
 
     spent_s : (3,) time of all solutions so far: to build, to factor with all analysis, to solve triangular systems
@@ -67,7 +67,7 @@ class LinearSolver:
         self._factored: Factored | None = None
 
     def solve(self, system: LinearSystem) -> NDArray[np.float64]:
-        """Solution (n,) in the least-squares sense; raises UndeterminedError where A has not full column rank."""
+        """Solution (n,) in the least-squares sense; raises UndeterminedError if A lacks full column rank."""
         laps_s = [working_s()]
         try:
             with warnings.catch_warnings():
@@ -85,13 +85,13 @@ class LinearSolver:
         return x
 
     def factor(self) -> Factor:
-        """That of the last solution."""
+        """Factor of the last solution."""
         assert self._factored is not None
         return self._factored.factor()
 
 
 class UndeterminedError(InputError):
-    """The equations do not determine some unknowns, whose ``columns`` these are."""
+    """The equations do not determine the unknowns of these ``columns``."""
 
     def __init__(self, layout: Layout, columns: NDArray[np.int64]) -> None:
         names = ", ".join(layout.name(int(column)) for column in columns[:_NAMED])
@@ -104,10 +104,10 @@ class UndeterminedError(InputError):
 
 
 def undetermined(system: LinearSystem) -> UndeterminedError:
-    """Error that names the undetermined unknowns: those with a share in the null space of A.
+    """Error that names the undetermined unknowns: those with a component in the null space of A.
 
     ε (H + ε I)⁻¹ tends to the projection onto the null space of H = AᵀA, here scaled to a unit diagonal; applied
-    a few times to a random vector it leaves a nonzero entry just where some null vector has one.
+    a few times to a random vector it leaves a nonzero entry exactly where some null vector has one.
     """
     if not (np.isfinite(system.values).all() and np.isfinite(system.b).all()):
         raise InputError("A x = b holds numbers that are not finite; start from a better guess")
@@ -127,7 +127,7 @@ def undetermined(system: LinearSystem) -> UndeterminedError:
 
 
 def check_pivots(pivots: NDArray[np.float64], whole: NDArray[np.float64]) -> None:
-    """Refuse pivots (n,) that are but rounding of their diagonal entries before elimination, ``whole`` (n,)."""
+    """Raise SingularMatrixError if pivots (n,) are rounding noise of the entries before elimination, ``whole``."""
     failed = np.flatnonzero(~(pivots > LOST_DIGITS * whole))
     if len(failed):
         raise SingularMatrixError(int(failed[0]), int(failed[0]))
@@ -140,9 +140,9 @@ def normal_equations(system: LinearSystem) -> tuple[csc_matrix, NDArray[np.float
 
 
 class ScipyMethod:
-    """AᵀA x = Aᵀb by what SciPy offers.
+    """AᵀA x = Aᵀb by solvers of SciPy.
 
-    ``default`` is spsolve, which returns no factor: that of splu with the same settings stands for it. ``pinv``
+    ``default`` is spsolve, which returns no factor: that of splu with the same settings is reported. ``pinv``
     forms (AᵀA)⁻¹; ``lu`` and ``lu_colamd`` are SuperLU in the natural order and in that of COLAMD.
     """
 
@@ -159,7 +159,7 @@ class ScipyMethod:
         diagonal = np.asarray(H.diagonal(), np.float64)
         if self._name == "pinv":
             inverse = csc_matrix(inv(H))
-            # the k-th pivot of an elimination that takes unknown k last is 1 / inverse[k, k]
+            # if unknown k is eliminated last, its pivot is 1 / inverse[k, k]
             check_pivots(1.0 / np.asarray(inverse.diagonal(), np.float64), diagonal)
             return Factored(lambda: inverse @ g, lambda: Factor("(AᵀA)⁻¹", inverse, np.arange(len(g))))
         lu = splu(H, permc_spec="COLAMD" if self._name == "lu_colamd" else "NATURAL")
@@ -172,7 +172,7 @@ def _upper(lu: SuperLU) -> Factor:
 
 
 class CholeskyMethod:
-    """Multifrontal Cholesky of AᵀA; while the pattern is the same only the numbers are computed again."""
+    """Multifrontal Cholesky of AᵀA; for an unchanged pattern only the numeric factorization is repeated."""
 
     build = staticmethod(normal_equations)
 
@@ -204,7 +204,7 @@ class QrMethod:
         self._analyzed = lru_cache(maxsize=1)(analyzed)
 
     def build(self, system: LinearSystem) -> Analysis:
-        """The order of the columns, by minimum degree in AᵀA where it is not natural, and where R has entries."""
+        """The order of the columns, natural or by minimum degree in AᵀA, and the sparsity pattern of R."""
         return self._analyzed(system.pattern)
 
     def factorize(self, system: LinearSystem, built: Analysis) -> Factored:
@@ -226,7 +226,7 @@ class QrMethod:
 
 
 def _order_of_rows(pattern: Pattern, place: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows of A that are not empty, by their first column and then their last, each column in its place (n,)."""
+    """Nonempty rows of A, ascending by first and then descending by last column, in their places (n,)."""
     rows = np.flatnonzero(np.diff(pattern.row_start))
     places = place[pattern.columns]
     first, last = (ends.reduceat(places, pattern.row_start[rows]) for ends in (np.minimum, np.maximum))
@@ -234,10 +234,10 @@ def _order_of_rows(pattern: Pattern, place: NDArray[np.int64]) -> NDArray[np.int
 
 
 class SchurMethod:
-    """Two stages: S = C − B P⁻¹ Bᵀ of AᵀA = [P, Bᵀ; B, C], dense as it joins every two landmarks, then the rest.
+    """Schur complement S = C − B P⁻¹ Bᵀ of AᵀA = [P, Bᵀ; B, C], dense as it couples all landmarks, then poses.
 
-    Poses joined by odometry alone make P banded. Where they are fewer than the landmarks, sparse Cholesky of the
-    whole is faster and takes its place.
+    P is banded, since only odometry joins the poses. If they have fewer unknowns than the landmarks, sparse
+    Cholesky of the whole matrix is faster and is used instead.
     """
 
     def __init__(self) -> None:
@@ -270,10 +270,10 @@ class Arrow:
 
 
 class Covariance:
-    """(AᵀA)⁻¹ between neighboring poses, between poses and landmarks, and between landmarks; never all of it."""
+    """(AᵀA)⁻¹ between neighboring poses, between poses and landmarks, and between landmarks; never the whole."""
 
     def __init__(self, system: LinearSystem) -> None:
-        """Raises UndeterminedError where A has not full column rank."""
+        """Raises UndeterminedError if A lacks full column rank."""
         self._layout = system.pattern.layout
         U, _ = _form(system)
         try:
@@ -285,12 +285,12 @@ class Covariance:
 
     @property
     def poses(self) -> Matrix:
-        """Of every pose, (K, p, p), relative to the first where that is held; m, rad."""
+        """Covariance of every pose, (K, p, p), relative to the first if that is fixed; m, rad."""
         return self.of(pose_columns(self._layout, np.arange(self._layout.poses)))
 
     @property
     def landmarks(self) -> Matrix:
-        """Of every landmark, (L, 2, 2) m²."""
+        """Covariance of every landmark, (L, 2, 2) m²."""
         return self.of(landmark_columns(self._layout, np.arange(len(self._layout.landmarks))))
 
     def of(self, columns: NDArray[np.int64]) -> Matrix:
@@ -337,7 +337,7 @@ def _eliminate(H: Arrow) -> None:
 
 
 def _factor_of_arrow(U: Arrow) -> Factor:
-    """The three parts put together."""
+    """The factor assembled from the three parts."""
     split = U.band.shape[1]
     poses = dia_array((U.band[::-1], np.arange(len(U.band))), shape=(split, split))
     matrix = block_array([[poses, csc_matrix(U.border)], [None, csc_matrix(np.triu(U.corner))]])
@@ -354,18 +354,18 @@ _MAKERS = {
     "cholesky": CholeskyMethod,
     "schur": SchurMethod,
 }
-PINV_BELOW = 3_000  # largest number of unknowns: their inverse is all but dense, 110 MB, and takes seconds
+PINV_BELOW = 3_000  # number of unknowns at which the inverse, almost dense, takes 110 MB and seconds
 METHODS = tuple(_MAKERS)
-ESTIMATOR = "schur"  # the fastest: it estimates where no other is requested
+ESTIMATOR = "schur"  # the fastest: makes the estimate where no other is requested
 
 
 def create_solver(method: str) -> LinearSolver:
-    """A solver by the method of that name."""
+    """A solver by the method of this name."""
     return LinearSolver(_MAKERS[method]())
 
 
 def parse_methods(text: str) -> tuple[str, ...]:
-    """The names of a list with commas; "all" stands for every method that suits the problem."""
+    """The names in a comma-separated list; "all" means every method that suits the problem."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     choice = f"choose from all, {', '.join(_MAKERS)}"
     for name in names:
@@ -377,14 +377,14 @@ def parse_methods(text: str) -> tuple[str, ...]:
 
 
 def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Methods to run on a problem of so many unknowns, and a fact about one that "all" leaves out there.
+    """Methods to run on a problem with this many unknowns, and a note on one that "all" leaves out.
 
-    Raises InputError where one is named that is too slow.
+    Raises InputError if a named one is too slow.
     """
     chosen = dict.fromkeys(method for name in requested for method in (METHODS if name == "all" else (name,)))
     if "pinv" not in chosen or unknowns < PINV_BELOW:
         return tuple(chosen), {}
-    why = f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
+    why = f"pinv, whose inverse is almost dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
     if "pinv" in requested:
         raise InputError(f"{why}; name other --methods")
     del chosen["pinv"]
@@ -400,9 +400,9 @@ class MethodResult:
 
     method : its name
     build_s, factor_s, solve_s : medians over the repetitions, each with a new solver; sums over the iterations
-    again_s : the whole once more with the same solver, which reuses its analysis of the pattern
+    again_s : the whole solution repeated with the same solver, which reuses its analysis of the pattern
     iterations : linear solves
-    factor : of the last one
+    factor : of the last solve
     x : (n,) the unknowns
     difference : largest entry of x minus that of the first method
     """
@@ -426,7 +426,7 @@ class MethodResult:
 def compare(
     solve: Callable[[LinearSolver], NDArray[np.float64]], methods: Sequence[str], repeats: int
 ) -> tuple[MethodResult, ...]:
-    """Let ``solve`` find the unknowns (n,) by every method in turn, slow ones once only."""
+    """Results of ``solve``, which finds the unknowns (n,), with every method in turn; slow ones run only once."""
     results = list[MethodResult]()
     for method in methods:
         solver, x, iterations, times_s = create_solver(method), np.empty(0), 0, list[NDArray[np.float64]]()

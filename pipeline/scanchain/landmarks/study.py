@@ -28,7 +28,7 @@ from scanchain.landmarks.problem import BearingRangeProblem, LandmarkData, Linea
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
 
-_WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
+_WIDEST_GAP_S = 0.5  # largest gap between motion-capture poses that is interpolated
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Estimate:
     """Poses and landmarks, and their accuracy.
 
     T_truth_estimate : (3, 3) aligns them to the truth
-    poses_m, landmarks_m : root mean squared distances from the truth, NaN without; ``definition`` defines them
+    poses_m, landmarks_m : root mean squared distances from the truth, NaN without it, as defined by ``definition``
     """
 
     state: Values
@@ -52,7 +52,7 @@ class Estimate:
 
 
 def of_positions(state: Values, data: LandmarkData) -> Estimate:
-    """Against the positions of an npz file, where it has them; both lie in one frame."""
+    """Estimate compared with the true positions of an npz file, if it has them; both are in the same frame."""
     known = len(data.true_poses) > 0
     if not known and np.isnan(data.true_landmarks).all():
         return Estimate(state, lie.identity(2), np.nan, np.nan, "no true positions in the file")
@@ -64,10 +64,10 @@ def of_positions(state: Values, data: LandmarkData) -> Estimate:
 def against_truth(
     states: Sequence[Values], nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64], log: RangeLog
 ) -> tuple[list[Estimate], Matrix, Matrix]:
-    """ATE of the poses of each state after rigid alignment, landmarks by the same one, against motion capture.
+    """Estimates with ATE against motion capture after rigid alignment, which is applied to the landmarks as well.
 
     nodes_s, landmarks : (K,) times of the poses, (L,) numbers of the landmarks
-    Returns also true positions (k, 2), and those of the landmarks (L, 2), NaN where one was not surveyed.
+    Also returns the true positions (k, 2) of poses, and (L, 2) of landmarks, NaN for those not surveyed.
     """
     place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
     surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
@@ -88,7 +88,7 @@ def against_truth(
 
 
 def _trajectory(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
-    """Poses x, y, heading (K, 3) at times that were written with milliseconds."""
+    """Poses x, y, heading (K, 3) at times that were logged in milliseconds."""
     stamps_ns = np.round(nodes_s * 1e3).astype(np.int64) * 1_000_000
     return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]).reshape(-1, 3, 3))
 
@@ -103,16 +103,16 @@ Guess = Literal["odometry", "disturbed", "origin"]
 
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 _DOWNWEIGHTED = 0.25  # share of its expected weight below which an observation is reported as downweighted
-_FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model fits
+_FITS = (0.5, 2.0)  # range of χ² per degree of freedom in which a noise model fits
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """Options of a study.
 
-    ``methods`` are the linear solvers by name, or "all"; the first one estimates what a file holds.
-    ``robot`` and ``noise`` are for MRCLAM folders, where a noise of None is to be estimated; ``guess`` and
-    ``optimizer`` for nonlinear files.
+    ``methods`` are the linear solvers by name, or "all"; the first one makes the estimate of a file.
+    ``robot`` and ``noise`` are for MRCLAM folders, where the noise is estimated if it is None; ``guess`` and
+    ``optimizer`` are for nonlinear files.
     """
 
     methods: tuple[str, ...]
@@ -127,14 +127,14 @@ class Options:
 class Study:
     """Results of a study.
 
-    name, facts : of the problem, and lines about it by label
-    before, after : optimization
-    converged : whether every iteration came to an end by itself
-    covariance : of poses and landmarks after it
+    name, facts : name of the problem, and descriptive lines by label
+    before, after : estimates before and after optimization
+    converged : whether the optimization converged
+    covariance : of poses and landmarks after optimization
     true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown
-    system, build_s : A x = b as the methods solved it, and the time to put it together
-    methods : how every method fared
-    trajectory : the poses after it with their stamps; None for a file, which has no stamps
+    system, build_s : A x = b as the methods solved it, and the time to assemble it
+    methods : result of every method
+    trajectory : the poses after optimization with their stamps; None for a file, which has no stamps
     """
 
     name: str
@@ -185,7 +185,7 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
     build_s = working_s() - begin
 
     def solve(solver: LinearSolver) -> NDArray[np.float64]:
-        if options.optimizer == "gradient-descent" or not minimum.iterations:  # solves none: take its end
+        if options.optimizer == "gradient-descent" or not minimum.iterations:  # no linear solves: use its end
             return solver.solve(system)
         return minimize(problem, guess, solver, optimizer=options.optimizer).estimate.state.unknowns
 
@@ -230,8 +230,8 @@ def _ended(minimum: Minimum, iterations: int) -> str:
 def study_log(folder: Path, options: Options) -> Study:
     """Read the log, estimate trajectory, landmarks and noise, compare with motion capture.
 
-    The requested linear solvers run on the first step from where the estimate began, with the noise that
-    it found; ``ESTIMATOR`` makes the estimate.
+    The requested linear solvers are compared on the first step from the initial guess, with the estimated noise;
+    ``ESTIMATOR`` makes the estimate.
     """
     log = read_mrclam(folder, options.robot)
     solution = solve_range_log(log, options.noise)
@@ -254,7 +254,8 @@ def study_log(folder: Path, options: Options) -> Study:
 def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[str, str]:
     noise = solution.consistency
     count = len(log.seen_s)
-    worth = f"count as {solution.loss.share.sum():.0f}, as errors of a landmark's successive sightings are alike"
+    share = solution.loss.share.sum()
+    worth = f"count as {share:.0f}, as errors of a landmark's successive sightings are correlated"
     nodes = counted(len(solution.nodes_s), "pose")
     seen = f"{count:,} of {len(solution.minimum.estimate.state.landmarks)} landmarks from {nodes}; they {worth}"
     left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"

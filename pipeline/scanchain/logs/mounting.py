@@ -22,7 +22,7 @@ _BASE_FRAMES = ("base_link", "base_footprint", "base")
 # words in names of frames that stand still
 _WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
-TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
+TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane above which its scans are no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
 
 

@@ -24,26 +24,26 @@ from scanchain.loops.verification import Verifier
 from scanchain.preprocess import downsample
 from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
 
-_KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
-_LARGE = 2000  # keyframes from which on those of one pass go before the nearest one
-_ALIKE_RAD = 0.5  # largest difference in heading from a keyframe of the first pass
-_ALONG = 10  # keyframes before and after the last target, among which the next one is
+_KEPT_M = 10.0  # distance from the anchor of a map's submap up to which it stays the target, at full scale
+_LARGE = 2000  # number of keyframes above which those of one pass are preferred to the nearest one
+_SAME_PASS_RAD = 0.5  # largest difference in heading from a keyframe of the first pass
+_ALONG = 10  # keyframes before and after the last target that are considered for the next one
 _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans are matched to
 
 _BASIN_M = 0.5  # largest uncertainty that matching corrects without a search
 _INTERVAL = 0.2  # share of the uncertainty that is traveled between two searches: wide windows cost most
 _RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of uncertainty
 _MIN_RAD = 0.1  # least half width of the window in heading
-_WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # within the drift: a second pose is as good
+_WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # a second answer means ambiguity
 
 
 class LoopCloser:
     """Searches from each new keyframe for older ones that it revisits and verifies them."""
 
     def __init__(self, config: Config, dimension: int, *, is_live: bool = False) -> None:
-        """Begin without keyframes.
+        """Start without keyframes.
 
-        is_live : whether a search of the whole map goes on over several scans, so that none of them waits for it;
+        is_live : whether a search of the whole map is spread over several scans, so that no scan waits for it;
             else it is completed at once, which finds a location sooner
         Raises InputError for a recognizer that cannot be loaded.
         """
@@ -61,10 +61,10 @@ class LoopCloser:
     def begin_in(
         self, keyframes: Sequence[Keyframe], folder: Path | None = None, *, is_final: bool = True
     ) -> float:
-        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters.
+        """Add the keyframes of a map, to which loops close first; returns the start of the log's path, in meters.
 
-        folder : of a map on disk, which keeps its outline
-        is_final : whether they stay where they are; else only those of one pass make a submap
+        folder : of a map on disk, which caches its outline
+        is_final : whether their poses are final; else a submap has keyframes of one pass only
         """
         self.near.of_map = len(keyframes)
         if is_final:
@@ -75,7 +75,7 @@ class LoopCloser:
 
     @property
     def alike_share(self) -> float:
-        """Share of the searches of a map, or of older segments, that found several places alike."""
+        """Share of the searches of a map, or of older segments, whose result was ambiguous."""
         finder = self.search.finder
         return finder.alike / max(finder.searches, 1)
 
@@ -91,11 +91,11 @@ class LoopCloser:
         self.search.search_again()
 
     def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
-        """True while the last match with the map lies little behind the newest keyframe."""
+        """True while the last match with the map is recent."""
         return self.search.is_tracking(keyframes)
 
     def advance(self) -> tuple[Closure, ...]:
-        """Closures by a search that is under way, which goes on with every scan, in slices of equal work."""
+        """Closures of the search in progress, which continues with every scan, in slices of equal work."""
         return self.search.advance()
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
@@ -132,7 +132,7 @@ class ProximityCloser:
     def __init__(
         self, config: LoopsConfig, submaps: VoxelSubmaps, verifier: Verifier, finder: PlanarFinder | None
     ) -> None:
-        """Begin without keyframes; ``finder`` aligns what is found within the drift, None in space."""
+        """Start without keyframes; ``finder`` aligns what is found within the drift, None in 3D."""
         self.config = config
         self.submaps = submaps
         self.verifier = verifier
@@ -206,9 +206,9 @@ class ProximityCloser:
     ) -> Closure | None:
         """The closure of the newest keyframe by a correlative search over all poses that the drift allows.
 
-        None where it fits nowhere in older keyframes together, or in two places.
+        None if it fits nowhere in the older keyframes together, or at two poses.
         near : keyframes within reach; radius_m : uncertainty of the position relative to them; old : number of
-            the keyframes that submaps may have
+            keyframes that submaps may contain
         """
         if radius_m <= _BASIN_M:
             return None
@@ -238,11 +238,11 @@ class ProximityCloser:
         return near[near < self.of_map] if (near < self.of_map).any() else near, uncertainty_m
 
     def _next(self, T_world: Matrix, old: int, connected: NDArray[np.bool_]) -> tuple[int, float]:
-        """The nearest of the older keyframes, and its distance; in large graphs of one pass over a place.
+        """The nearest of the older keyframes, and its distance; in large graphs, the nearest one of a single pass.
 
-        So revisits of a place that was passed many times are not closed to another pass each, and its submaps are
-        used again. In space it is the pass that was matched last. In the plane it is the first: after a slip of
-        odometry in a corridor, keyframes would be closed to each other.
+        Thus revisits of a location that was passed many times do not each close to another pass, and its submaps
+        are reused. In 3D it is the pass that was matched last. In 2D it is the first one: otherwise, after a slip
+        of odometry in a corridor, the keyframes since would be closed to each other.
         """
         if old >= _LARGE and self.submaps.dimension == 2:
             first = on_first_pass(T_world, connected[:old], self.config.min_radius_m)
@@ -267,13 +267,13 @@ class ProximityCloser:
 
 
 def on_first_pass(T_world: Matrix, chosen: NDArray[np.bool_], reach_m: float) -> int:
-    """Where the first pass by the newest keyframe (K, 3, 3) was nearest, of those chosen (n,); −1 if none was.
+    """The keyframe of the first pass that is nearest to the newest one, of those chosen (n,); −1 without any.
 
-    A pass is of keyframes one after the other within reach and of about the same heading.
+    A pass consists of successive keyframes within reach and with about the same heading. T_world : (K, 3, 3)
     """
     distances_m = _distances_m(T_world, slice(len(chosen)))
     cosines = (T_world[: len(chosen), :2, 0] * T_world[-1, :2, 0]).sum(axis=1)
-    near = np.flatnonzero(chosen & (distances_m <= reach_m) & (cosines >= np.cos(_ALIKE_RAD)))
+    near = np.flatnonzero(chosen & (distances_m <= reach_m) & (cosines >= np.cos(_SAME_PASS_RAD)))
     if not len(near):
         return -1
     goes_on = (np.diff(near) == 1) & (np.diff(distances_m[near]) <= 0.0)

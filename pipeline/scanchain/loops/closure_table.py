@@ -17,7 +17,7 @@ _OF_CLOSURE = [field.name for field in fields(Closure) if field.name != "match"]
 
 
 class ClosureTable(Sequence[Closure]):
-    """Closures in a fifth of the memory of their objects, which are made where they are asked for."""
+    """Closures in a fifth of the memory of their objects, which are created on access."""
 
     def __init__(self) -> None:
         self._closures, self._matches = Columns(), Columns()

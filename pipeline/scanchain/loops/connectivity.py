@@ -9,7 +9,7 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.graph.paths import path_lengths
 
-_MIN_WEIGHT = 0.5  # robust weight of a loop edge, from which on it connects its keyframes
+_MIN_WEIGHT = 0.5  # robust weight of a loop edge above which it connects its keyframes
 _LOOP_LENGTH_M = 1e-3  # length of a loop edge in the shortest path: it adds next to no drift
 
 
@@ -18,7 +18,7 @@ class Segments:
 
     def __init__(self) -> None:
         self.starts = [0]
-        self.assumed = -1  # number of the one that the newest counts as joined to while that is being tested
+        self.assumed = -1  # number of the segment that the newest one is assumed to be joined to, while tested
 
     def start(self, keyframe: int) -> None:
         """Start a new segment at this keyframe."""
@@ -38,14 +38,14 @@ class Segments:
         return np.searchsorted(self.starts, keyframes, side="right") - 1
 
     def span(self, keyframe: int, count: int) -> tuple[int, int]:
-        """First keyframe and end of a keyframe's segment, of so many keyframes in all."""
+        """First keyframe and end of a keyframe's segment, out of ``count`` keyframes."""
         number = int(self.of(np.array(keyframe)))
         return self.starts[number], [*self.starts[1:], count][number]
 
     def components(self, graph: PoseGraph, *, with_assumed: bool = True) -> NDArray[np.int64]:
         """Number of the connected component of each keyframe (K,): segments that loops join have the same one.
 
-        with_assumed : whether the newest segment is taken for joined to where it is being tested
+        with_assumed : whether the newest segment counts as joined to the one where it is being tested
         """
         count = len(self.starts)
         segment = np.repeat(np.arange(count), np.diff([*self.starts, len(graph)]))
@@ -64,19 +64,19 @@ class Segments:
 class Drift:
     """Position uncertainty between keyframes: the drift of odometry along the shortest path that connects them.
 
-    An edge is as long as its translation or, where odometry was unsure, as a path along which it would have
-    drifted as far as the edge's standard deviation.
+    The length of an edge is that of its translation or, where odometry was more uncertain, that of a path with a
+    drift equal to the edge's standard deviation.
     """
 
     def __init__(self, drift: float) -> None:
-        """Drift : of odometry, meters a meter."""
+        """Drift : of odometry, meters per meter."""
         self.drift = drift
         self.lengths = GrowingArray((), np.float64)
 
     def measure(self, graph: PoseGraph) -> None:
-        """Take the lengths of the edges that are new since the last call, odometry corrected as it is now.
+        """Add the lengths of the edges that are new since the last call, with odometry as corrected now.
 
-        What is neither odometry nor a loop is no path.
+        Edges that are neither odometry nor loops are not part of any path.
         """
         if len(self.lengths) == len(graph.edges):
             return
@@ -96,5 +96,5 @@ class Drift:
         is_open = ~graph.is_loop | (graph.weight > _MIN_WEIGHT)
         lengths = np.where(is_open, self.lengths.rows, np.inf)
         meters = path_lengths(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
-        meters[graph.held] = meters[graph.held].min(initial=np.inf)  # they do not drift against each other
+        meters[graph.held] = meters[graph.held].min(initial=np.inf)  # they do not drift relative to each other
         return np.minimum(self.drift * meters, limit_m)

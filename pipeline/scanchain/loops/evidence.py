@@ -1,4 +1,4 @@
-"""Evidence that keyframes are at a place: a sequential test of their fits, and of free space that agrees."""
+"""Evidence that keyframes are at a location: a sequential test of their matches and of free-space agreement."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Prop
 from scanchain.kernels.free_space import compare_ranges, nearest_ranges
 from scanchain.loops.connectivity import Segments
 
-_NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
+_NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes whose free space is compared
 _BINS = 360  # of azimuth, 1°; as fine in elevation
-_MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
-_IN_SIGHT = 0.3  # share of the points of a keyframe, from which on those in view of the map's nearest one show it
-_RISK = 1e-3  # that a pose is taken up which is wrong
-_DROPPED = -3.0  # log-odds down to which a pose is tested
-_RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
-_FINAL = math.log(10.0)  # log-odds more in the end, when nothing that is seen later can withdraw a pose
-_FOLLOWED_M = 50.0  # path since the last match, up to which keyframes contradict a location, or it is tested
-LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
+_MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, plus that share of them
+_IN_SIGHT = 0.3  # least share of a keyframe's points in view of the map's nearest one for it to be in sight
+_RISK = 1e-3  # probability that an accepted pose is wrong
+_REJECTED = -3.0  # log-odds at or below which a pose is rejected
+_RESERVE = 5.0  # largest log-odds above the bound: a pose that was right for long may turn out wrong
+_FINAL = math.log(10.0)  # additional log-odds in the end, when no later observation can withdraw a pose
+_TRACKED_M = 50.0  # path since the last match beyond which keyframes do not count and a test ends
+LARGEST_RATIO = 2.0  # largest log-likelihood ratio of one keyframe
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
-_OF_FIND = {2: 4.0, 3: 5.0}  # log-odds of a find by a search: of most right places, of others in 0.004 and 0.001
-_SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are sought together, at full scale
-_NO_OVERLAP = 0.3  # overlap from which on a fit is evidence
-_IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from which on that knows the place
-_LATEST = 10  # number of the last keyframes that counted, from which the next one may not be independent
-_INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path from which on two keyframes are independent, at full scale
+_OF_FIND = {2: 4.0, 3: 5.0}  # log-odds of a search result: finds most correct poses, wrong ones in 0.4 %, 0.1 %
+_SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are searched for together, at full scale
+_NO_OVERLAP = 0.3  # overlap above which a match is evidence
+_IN_SIGHT_OF_BOTH = 0.2  # share of points in view of the other keyframe for which the comparison counts in full
+_LATEST = 10  # number of last counted keyframes on which the next one may depend
+_INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path beyond which two keyframes are independent, at full scale
 _AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
 
 
@@ -62,7 +62,7 @@ def compared(
 
 
 def is_in_sight(keyframe: Keyframe, others: Sequence[Keyframe]) -> bool:
-    """True if a keyframe shows what the nearest one of the others shows, or what it sees through."""
+    """True if enough points of a keyframe are in view of the nearest one of the others."""
     positions = np.array([each.T_odom_lidar[:-1, -1] for each in others])
     away_m = np.linalg.norm(positions - keyframe.T_odom_lidar[:-1, -1], axis=1)
     seen = compared([others[int(away_m.argmin())]], [keyframe]).sum()
@@ -70,27 +70,26 @@ def is_in_sight(keyframe: Keyframe, others: Sequence[Keyframe]) -> bool:
 
 
 class PlaceTest:
-    """Sequential test (Wald 1945) of the pose where the newest segment of a log is taken to be.
+    """Sequential test (Wald 1945) of the assumed pose of the newest segment of a log among older keyframes.
 
-    Older keyframes, of a map or of segments before, are the place. Each keyframe that was tried against them there
-    adds the logarithm of how much likelier what it shows is at a right pose than at the best of wrong ones;
-    keyframes closer than they are independent count in part. The pose is taken up where the sum passes what the
-    risk asks for, over all the path sought. It is dropped where the sum says that it is wrong: withdrawn, if it
-    had been taken up.
+    The older keyframes are those of a map or of earlier segments. Each keyframe that was matched with them adds
+    its log-likelihood ratio: correct pose against the best wrong one; keyframes too close to be independent count
+    in part. The pose is accepted once the sum exceeds the acceptance threshold, which follows from the risk and
+    the length of the path searched. It is rejected once the sum is too low, and withdrawn if it was accepted.
 
     Methods take closures with older keyframes, all keyframes so far, and their poses T_world (K, d+1, d+1).
     """
 
     def __init__(self, segments: Segments) -> None:
         self.segments = segments
-        self.is_given = False  # whether the pose of the first scan in a map is
-        self.searches = 1.0  # for independent parts of the path so far
-        self.log_odds = 0.0  # of the present one
-        self.matches = 0.0  # independent keyframes that matched there, by which two accepted poses compare
-        self.best = math.nan  # of those that the log ended with, or a segment
+        self.is_given = False  # whether the pose of the first scan in a map was given
+        self.searches = 1.0  # number of searches of independent parts of the path so far
+        self.log_odds = 0.0  # of the present pose
+        self.matches = 0.0  # number of independent keyframes that matched there, to compare two accepted poses
+        self.best = math.nan  # largest log-odds of the poses tested so far that were not rejected
         self.matched_m = 0.0  # path up to the last match with older keyframes
-        self.waiting: list[Closure] = []  # accepted and agreeing with the first
-        self.counted_m: list[float] = []  # places along the path of the keyframes that counted
+        self.waiting: list[Closure] = []  # accepted closures that agree with the first one
+        self.counted_m: list[float] = []  # path lengths at the keyframes that counted
         self.tried: dict[int, Closure] = {}  # of each keyframe, the best closure at its pose there
 
     @property
@@ -105,7 +104,7 @@ class PlaceTest:
 
     @property
     def bound(self) -> float:
-        """Log-odds from which on a pose is taken up: the longer the path that was sought, the higher."""
+        """Log-odds above which a pose is accepted; the longer the path that was searched for, the higher."""
         return math.log(max(self.searches, 1.0) / _RISK)
 
     def collect(
@@ -116,9 +115,9 @@ class PlaceTest:
         *,
         least_matches: float = 0.0,
     ) -> tuple[Closure, ...]:
-        """Take closures of a segment that none joins to older ones; all that waited, once they join it.
+        """Add closures of a segment not joined to older ones; returns all that waited once its pose is accepted.
 
-        least_matches : number of matches that it needs more than, that of the pose which it would replace
+        least_matches : number of matches that it must exceed: that of the pose that it would replace
         """
         if not self.is_gathering:
             if all(each.verdict is ClosureVerdict.REJECTED for each in closures):
@@ -141,42 +140,42 @@ class PlaceTest:
         return joining
 
     def give(self) -> None:
-        """The pose of the first scan in the map is given: it is believed until what is seen contradicts it."""
+        """Accept a given pose of the first scan in the map, until observations contradict it."""
         self.is_given, self.log_odds = True, self.bound + _RESERVE
 
     def replace_by(self, other: PlaceTest) -> None:
-        """Go on with the pose that another test accepted, in place of the one that was withdrawn."""
+        """Continue with the pose that another test accepted, in place of the one that was withdrawn."""
         self.log_odds, self.matches, self.searches = other.log_odds, other.matches, other.searches
         self.matched_m, self.counted_m = other.matched_m, other.counted_m
         self.tried |= other.tried
 
     def follow(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
-        """Take closures of a segment that is joined to older ones; False once they say that it is not there.
+        """Add closures of a segment that is joined to older ones; returns False once its pose is rejected.
 
-        Far from the last match nothing counts: drift may have led away from the place.
+        Far from the last match nothing counts: odometry may have drifted away from the location.
         """
         for each in _best_of_each([each for each in closures if _is_there(each)]):
-            if keyframes[each.source].traveled_m - self.matched_m <= _FOLLOWED_M * keyframes[each.source].scale:
+            if keyframes[each.source].traveled_m - self.matched_m <= _TRACKED_M * keyframes[each.source].scale:
                 self._count(each, keyframes, self._ratio(each, keyframes, T_world))
             if each.verdict is ClosureVerdict.ACCEPTED:
                 self.matched_m = keyframes[each.source].traveled_m
         self.log_odds = min(self.log_odds, self.bound + _RESERVE)
-        return self.log_odds > _DROPPED
+        return self.log_odds > _REJECTED
 
     def note(self, closures: Sequence[Closure]) -> None:
-        """Note closures that were tried at the pose where their keyframes lie."""
+        """Record closures that were tried at the current pose of their keyframes."""
         for each in filter(_is_there, closures):
             known = self.tried.get(each.source)
             if known is None or rank_of(each) > rank_of(known):
                 self.tried[each.source] = each
 
     def is_in_vain(self, newest: Keyframe) -> bool:
-        """True if the pose that is being tested is wrong, or nothing has matched there for a while."""
+        """True if the pose that is being tested is to be rejected, or nothing has matched there for a while."""
         since_m = newest.traveled_m - self.matched_m
-        return self.is_gathering and (self.log_odds <= _DROPPED or since_m > _FOLLOWED_M * newest.scale)
+        return self.is_gathering and (self.log_odds <= _REJECTED or since_m > _TRACKED_M * newest.scale)
 
     def drop(self, start: int) -> None:
-        """The newest segment, from a keyframe on, is not where it was tested; forget what was tried."""
+        """Reject the pose of the newest segment, which begins at ``start``, and forget what was tried there."""
         self._remember()
         self.tried = {source: each for source, each in self.tried.items() if source < start}
         self.is_given, self.log_odds, self.matches, self.waiting = False, 0.0, 0.0, []
@@ -184,10 +183,10 @@ class PlaceTest:
     def holds(
         self, placed: range, keyframes: Sequence[Keyframe], T_world: Matrix, *, of_same_log: bool = False
     ) -> bool:
-        """True if some keyframes, by their numbers, stand at their final poses where they are tried.
+        """True if some keyframes, given by their numbers, pass the test at their final poses.
 
-        of_same_log : whether the older ones are of one log with them, and as likely near them as not; of a log in
-            a map what is seen has to speak for itself
+        of_same_log : whether the older ones are of the same log, and as likely near them as not; for a log in a
+            map, the observations alone have to suffice
         """
         prior = _OF_FIND[T_world.shape[-1] - 1] - _FINAL if of_same_log else 0.0
         self.counted_m, self.log_odds = [], self.bound + _RESERVE if self.is_given else prior
@@ -198,18 +197,18 @@ class PlaceTest:
         return self.log_odds >= self.bound
 
     def _count(self, closure: Closure, keyframes: Sequence[Keyframe], ratio: float) -> None:
-        """Count a keyframe, whose logarithm of the likelihood ratio this is, by its share that is independent."""
+        """Add the log-likelihood ratio of a keyframe, weighted by its independent share."""
         weight = self._weight(keyframes[closure.source])
         self.log_odds += weight * ratio
         self.matches += weight * (ratio > 0.0)
 
     def _remember(self) -> None:
-        """Keep the log-odds of the present pose, if they are the best so far of those not known to be wrong."""
-        if self.log_odds > _DROPPED:
+        """Remember the log-odds of the present pose if it is not rejected and they are the best so far."""
+        if self.log_odds > _REJECTED:
             self.best = float(np.fmax(self.best, self.log_odds))
 
     def _weight(self, keyframe: Keyframe) -> float:
-        """Share of an independent observation that a keyframe is, after those that counted."""
+        """Share of a keyframe that is independent of those already counted."""
         apart_m = _INDEPENDENT_M[keyframe.T_odom_lidar.shape[0] - 1] * keyframe.scale
         since_m = min((abs(keyframe.traveled_m - each) for each in self.counted_m[-_LATEST:]), default=apart_m)
         self.counted_m.append(keyframe.traveled_m)
@@ -221,29 +220,29 @@ class PlaceTest:
     def _ratio_at(
         self, T_world_source: Pose, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix
     ) -> float:
-        """Logarithm of the likelihood ratio of what a keyframe at a pose shows, of a right pose to a wrong one.
+        """Log-likelihood ratio of a keyframe at a pose: correct pose against a wrong one.
 
-        Free space is that of the nearest keyframe of the segment which the closure is with.
+        Free space is compared with the nearest keyframe of the segment that the closure is with.
         """
         first, end = self.segments.span(closure.target, closure.source)
         away_m = np.linalg.norm(T_world[first:end, :-1, -1] - T_world_source[:-1, -1], axis=1)
         nearest = first + int(away_m.argmin())
         placed = replace(keyframes[closure.source], T_odom_lidar=T_world_source)
-        beside = replace(keyframes[nearest], T_odom_lidar=T_world[nearest])
-        agreeing, contradicting = (compared([placed], [beside]) + compared([beside], [placed])).tolist()
-        return log_ratio(closure, agreeing, contradicting, len(placed.points) + len(beside.points))
+        neighbor = replace(keyframes[nearest], T_odom_lidar=T_world[nearest])
+        agreeing, contradicting = (compared([placed], [neighbor]) + compared([neighbor], [placed])).tolist()
+        return log_ratio(closure, agreeing, contradicting, len(placed.points) + len(neighbor.points))
 
     def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
-        """True if a closure implies the pose of its source that the first one does."""
+        """True if a closure implies the same pose of its source as the first waiting one."""
         poses = (pose_by(each, closure.source, keyframes, T_world) for each in (self.waiting[0], closure))
         off_m, off_rad = lie.apart(*poses)
         return off_m < _AGREE_M * keyframes[closure.source].scale and off_rad < _AGREE_RAD
 
 
 def log_ratio(closure: Closure, agreeing: int, contradicting: int, points: int) -> float:
-    """Logarithm of how much likelier a closure with a map is at a right pose than at the best of wrong ones.
+    """Log-likelihood ratio of a closure with a map: correct pose against the best wrong one.
 
-    The weights of its ``features`` are a logistic regression over keyframes at right and at wrong poses
+    The weights of its ``features`` are from a logistic regression over keyframes at correct and wrong poses
     (tests.benchmarks.place_odds).
     """
     shown = features(closure, agreeing, contradicting, points)
@@ -252,9 +251,9 @@ def log_ratio(closure: Closure, agreeing: int, contradicting: int, points: int) 
 
 
 def features(closure: Closure, agreeing: int, contradicting: int, points: int) -> tuple[float, float, float]:
-    """What speaks for and against a pose: a fit, none where the map shows what the scan does, free space.
+    """Features of the place classifier: fit, no fit although in view of the map, and contradicted free space.
 
-    agreeing, contradicting : numbers of points in view of the other side, of so many points of both
+    agreeing, contradicting : numbers of points in view of the other keyframe, out of ``points`` of both
     """
     fit = max(closure.overlap - _NO_OVERLAP, 0.0) / (1.0 - _NO_OVERLAP) if closure.match.is_fit else 0.0
     seen = agreeing + contradicting
@@ -263,12 +262,12 @@ def features(closure: Closure, agreeing: int, contradicting: int, points: int) -
 
 
 def _is_there(closure: Closure) -> bool:
-    """True for a closure that was tried where its keyframe lies, and for one that a search found."""
+    """True for a closure that was tried at the pose of its keyframe, and for an accepted one of a search."""
     return closure.proposed_by is Proposal.POSITION or closure.verdict is ClosureVerdict.ACCEPTED
 
 
 def _best_of_each(closures: Sequence[Closure]) -> list[Closure]:
-    """Of the closures of each keyframe, the best."""
+    """The best closure of each keyframe."""
     best: dict[int, Closure] = {}
     for each in closures:
         if each.source not in best or rank_of(each) > rank_of(best[each.source]):
@@ -277,7 +276,7 @@ def _best_of_each(closures: Sequence[Closure]) -> list[Closure]:
 
 
 def rank_of(closure: Closure) -> tuple[bool, float]:
-    """By which the best of several closures is the greatest: accepted ones first, then by overlap."""
+    """Sort key of closures, greatest for the best: accepted ones first, then by overlap."""
     return closure.verdict is ClosureVerdict.ACCEPTED, closure.overlap
 
 

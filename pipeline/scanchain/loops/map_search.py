@@ -1,4 +1,4 @@
-"""Search of a whole map in space: its upright structure and that of a path, correlated as seen from above."""
+"""Search of a whole 3D map: bird's-eye-view correlation of its upright structure with that of a path."""
 
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ from scanchain.maps.saved_map import read_arrays
 from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, Search, evenly, upright_columns
 
-MEMBERS = 10  # number of the newest keyframes that are sought together
-_RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought
+MEMBERS = 10  # number of the newest keyframes that are searched for together
+_RADIUS = 1.5  # radii of a submap up to which structure around the lidar is used
 _COLUMNS = 150  # number of columns that are scored, evenly spread
-_COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # cells, in fine ones, and numbers of the first search
-_REFINED_RAD = 0.15  # half width of the window in heading around what it found
-_MIN_COLUMNS = 30  # number of columns, below which there is too little to see
+_COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # coarse search: cell size in fine cells, counts
+_REFINED_RAD = 0.15  # half width of the window in heading around its results
+_MIN_COLUMNS = 30  # least number of columns for a search
 _MAX_CELLS = 1 << 21  # of the coarse grid of a map; a larger one has coarser cells
-_VERIFIED = 3  # number of poses that are verified in one scan
+_VERIFIED = 3  # number of poses that are verified per scan
 _MIN_SHARE = 0.55  # least share of the columns that lie on the map's
-_RIVAL = 0.85  # share of the best score, from which on another pose is verified, too
+_RIVAL = 0.85  # share of the best score above which another pose is verified, too
 _SEEDS = 4  # largest number of poses that are verified
 _APART = 4.0  # least distance of two distinct poses, cells
-_MIN_AGREEMENT = 0.8  # least agreement about free space with a map of another day: cars and people are others
+_MIN_AGREEMENT = 0.8  # least free-space agreement with a map of another day: cars and people differ
 _REACH = 0.5  # radii of a submap from the map's keyframes, beyond which nothing is verified
 _LEVEL_M = 2.0  # least difference in height of two stories
 _MAX_LEVELS = 3  # number of stories that are tried
-_AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two finds imply
+_AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two closures imply
 PLACES_FILE = "places.npz"
 VERSION = 1
-_TOGETHER = 10  # number of keyframes whose points are seen together; drift between more would raise the ground
-_MAX_LEVELED = 16  # number of keyframes, evenly spread, whose ground says where the map's vertical is
-_ALIKE = Problem.plain("another place of the map is as similar")
+_TOGETHER = 10  # number of keyframes whose points are combined; over more, drift would make ground look upright
+_MAX_LEVELED = 16  # number of keyframes, evenly spread, whose ground gives the map's vertical
+_AMBIGUOUS = Problem.plain("another location in the map is as similar")
 
 
 @dataclass(frozen=True, slots=True)
 class Outline:
     """Upright structure of a map.
 
-    T_map_level : (4, 4) to the frame whose z axis is normal to the ground, on average, its origin at whole 100 km
-    columns : (M, 2) where it is upright, level frame
-    size_m : edge length of the cells that the map was seen in
+    T_map_level : (4, 4) of the frame whose z axis is normal to the ground, on average, its origin at whole 100 km
+    columns : (M, 2) positions of upright structure, level frame
+    size_m : edge length of the cells of the columns
     """
 
     T_map_level: Pose
@@ -63,20 +63,20 @@ class Outline:
 
 
 class UprightMap:
-    """Keyframes where they lie in the world, and their upright structure, in which poses are sought."""
+    """Keyframes at their world poses, and their upright structure, in which poses are searched."""
 
     def __init__(self, keyframes: Sequence[Keyframe], config: Config, folder: Path | None = None) -> None:
-        """See keyframes from above; what is seen is kept in the folder of a map."""
+        """Extract the upright structure of keyframes; the folder of a map caches it."""
         self.config, self.keyframes, self.verifier = config, keyframes, Verifier(config)
         self.radius_m = config.loops.place_radius_m * float(np.median([each.scale for each in keyframes]))
         outline = outline_of(folder, keyframes, config.local_map)
         self.T_world = np.array([each.T_odom_lidar for each in keyframes])
         self.T_level = lie.inverse(outline.T_map_level) @ self.T_world
         self.size_m, self.columns = outline.size_m, outline.columns
-        self.grid: SearchGrid | None = None  # drawn when first searched
+        self.grid: SearchGrid | None = None  # rasterized at the first search
 
     def found(self, members: Sequence[Keyframe]) -> Generator[None, None, Closure | None]:
-        """The closure of the last one of some keyframes with the map's; None where nothing is alike."""
+        """The closure of the last one of some keyframes with one of the map; None if nothing is similar."""
         newest = members[-1]
         T_newest_level = level_frame(newest, self.config.local_map)
         T_level_odom = lie.inverse(T_newest_level) @ lie.inverse(newest.T_odom_lidar)
@@ -96,21 +96,21 @@ class UprightMap:
             return tried[0][0] if tried else None
         best, T_best = max(accepted, key=lambda each: each[0].overlap)
         off_m, off_rad = np.array([lie.apart(T_best, T) for _, T in accepted]).T
-        return best if (off_m < _AGREE_M).all() and (off_rad < _AGREE_RAD).all() else best.rejected(_ALIKE)
+        return best if (off_m < _AGREE_M).all() and (off_rad < _AGREE_RAD).all() else best.rejected(_AMBIGUOUS)
 
     def is_repeated(self, members: Sequence[Keyframe]) -> bool:
-        """True if what some keyframes show is in several places of the map."""
+        """True if the structure around some keyframes is found at several locations in the map."""
         closure = completed(self.found(members))
-        return closure is not None and closure.cause == _ALIKE.cause
+        return closure is not None and closure.cause == _AMBIGUOUS.cause
 
     def seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
-        """The best poses (3, 3) of points in the level frame of the map, sought coarsely, then refined."""
+        """The best poses (3, 3) of points in the level frame of the map, from a coarse search, then refined."""
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
         columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
         if len(columns) < _MIN_COLUMNS or not len(self.columns):
             return ()
         if self.grid is None:
-            self.grid = self._drawn()
+            self.grid = self._rasterized()
         coarse_m = self.grid.resolution_m
         wanted = Wanted(_APART * coarse_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
         poses = yield from searched(Search(evenly(columns, _COARSE_COLUMNS), self.grid, None, wanted))
@@ -136,7 +136,7 @@ class UprightMap:
         return chosen
 
     def on_ground(self, k: int, T_plane_source: Pose) -> Pose:
-        """T_target_source of a level source at a place, on the plane of the ground around the k-th keyframe."""
+        """T_target_source of a level source at a planar pose, on the ground plane around the k-th keyframe."""
         T_level_target = self.T_level[k]
         up = T_level_target[:3, :3] @ level_frame(self.keyframes[k], self.config.local_map)[:3, 2]
         T = upright_frame(up, np.append(T_plane_source[:2, 0], 0.0))
@@ -146,13 +146,13 @@ class UprightMap:
         return lie.inverse(T_level_target) @ T
 
     def submap(self, k: int) -> Submap:
-        """The keyframes around the k-th one, whichever path they lie on."""
+        """The submap of the keyframes around the k-th one, of all passes."""
         away_m = np.linalg.norm(self.T_level[:, :3, 3] - self.T_level[k, :3, 3], axis=1)
         members = [self.keyframes[index] for index in np.flatnonzero(away_m < self.radius_m).tolist()]
         return Submap(self.keyframes[k], members, self.radius_m)
 
-    def _drawn(self) -> SearchGrid:
-        """The coarse grid of the map; poses that it finds may be a cell farther off than those verified."""
+    def _rasterized(self) -> SearchGrid:
+        """The coarse grid of the map; poses are searched up to a cell farther out than they are verified."""
         positions = self.T_level[:, :2, 3]
         reach_m = _REACH * self.radius_m + _COARSE * self.size_m
         extent = np.vstack([self.columns, positions - reach_m, positions + reach_m])
@@ -166,7 +166,7 @@ class UprightMap:
 
 
 class UprightFinder:
-    """The last keyframes of a path, sought together in older ones as seen from above; then verified in space."""
+    """Search for the last keyframes of a path in older ones, by bird's-eye view; then verified in 3D."""
 
     first_m, least_m, most_m = 0.0, 1.0, 2.0
     match_m = 3.5
@@ -183,12 +183,12 @@ class UprightFinder:
         """The closure of the newest keyframe with the older ones, verified or not; see ``Finder``."""
         closure = yield from target.found(keyframes[max(start, len(keyframes) - MEMBERS) :])
         self.searches += 1
-        self.alike += closure is not None and closure.cause == _ALIKE.cause
+        self.alike += closure is not None and closure.cause == _AMBIGUOUS.cause
         return () if closure is None else (closure,)
 
 
 def outline_of(folder: Path | None, keyframes: Sequence[Keyframe], config: LocalMapConfig) -> Outline:
-    """The outline of keyframes; a map's folder holds it from the first time on where it can be written to.
+    """The outline of keyframes; a map's folder caches it if it is writable.
 
     keyframes : of the map; their ``T_odom_lidar`` is T_map_lidar
     """
@@ -202,7 +202,7 @@ def outline_of(folder: Path | None, keyframes: Sequence[Keyframe], config: Local
     if folder is not None:
         data, count = io.BytesIO(), len(keyframes)
         np.savez(data, version=VERSION, keyframes=count, T_map_level=T_map_level, columns=columns, size_m=size_m)
-        with suppress(OSError):  # a map that cannot be written to is searched all the same
+        with suppress(OSError):  # a read-only map is searched without the cache
             write_whole(folder / PLACES_FILE, data.getvalue())
     return Outline(T_map_level, columns.astype(np.float64), size_m)
 
@@ -219,7 +219,7 @@ def _stored(path: Path, count: int) -> Outline | None:
 
 
 def level_of(keyframes: Sequence[Keyframe], poses: Sequence[Pose] | Matrix, config: LocalMapConfig) -> Pose:
-    """T_map_level by the ground around some of the keyframes, whose poses in the map these are."""
+    """T_map_level from the ground around some of the keyframes, given their poses in the map."""
     step = max(-(-len(keyframes) // _MAX_LEVELED), 1)
     chosen = zip(keyframes[::step], poses[::step], strict=True)
     up = sum((T[:3, :3] @ level_frame(k, config)[:3, 2] for k, T in chosen), np.zeros(3))
@@ -227,7 +227,7 @@ def level_of(keyframes: Sequence[Keyframe], poses: Sequence[Pose] | Matrix, conf
 
 
 def _columns(keyframes: Sequence[Keyframe], T_level_map: Pose, size_m: float) -> Matrix:
-    """Upright columns (M, 2), one a cell."""
+    """Upright columns (M, 2), one per cell."""
     seen: list[NDArray[np.float64]] = []
     for first in range(0, len(keyframes), _TOGETHER):
         members = keyframes[first : first + _TOGETHER]

@@ -1,4 +1,4 @@
-"""The recognizer for 3D logs: the upright structure of a submap, sought in that of older ones within the drift."""
+"""The recognizer for 3D logs: searches older submaps for the upright structure of a submap, within the drift."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from scanchain.loops.submaps import Submap, level_frame, upright_frame
 from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, evenly, upright_columns
 
-_COLUMNS, _MIN_COLUMNS = 150, 30  # number of columns that are scored, evenly spread, and that are too few to see
+_COLUMNS, _MIN_COLUMNS = 150, 30  # numbers of columns that are scored, evenly spread, and least for a query
 _REACH, _HEADING_RAD = 0.1, 0.5  # largest error of odometry: position, as a share of the path between, and heading
-_MAX_REACH_M, _MAX_CELLS = 1000.0, 800  # of the window to either side, and along it, beyond which cells grow
-_MIN_SHARE = 0.4  # least share of the columns that lie on older ones: from the other side half is hidden
+_MAX_REACH_M, _MAX_CELLS = 1000.0, 800  # half width of the window, and cells along it; beyond, cells grow
+_MIN_SHARE = 0.4  # least share of the columns that lie on older ones: half is hidden from the other side
 _POSES, _APART = 8, 4.0  # largest number of poses that are compared, and least distance of two, cells
-_RIVAL = 0.9  # share of the best score, from which on a pose elsewhere makes it ambiguous
-_MIN_APART = 0.25  # least distance in radii of a submap between two poses that are not the same
+_RIVAL = 0.9  # share of the best score above which a pose elsewhere makes it ambiguous
+_MIN_APART = 0.25  # least distance in radii of a submap between two distinct poses
 _TARGETS, _VERIFIED = 8, 8  # largest number of older submaps that a pose is refined in, and of those verified
 _REFINED, _REFINED_RAD = 3.0, 0.15  # half widths of the window around it, cells and radians
 _TOUCHING = 1.5  # cells, within which a column lies on another one
@@ -32,7 +32,7 @@ _TOUCHING = 1.5  # cells, within which a column lies on another one
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """Upright columns (M, 2) of a submap in its level frame; T_anchor_level is that frame in its keyframe's."""
+    """Upright columns (M, 2) of a submap in its level frame; T_anchor_level is the pose of that frame."""
 
     anchor: int
     T_anchor_level: Pose
@@ -41,10 +41,10 @@ class Outline:
 
 
 class OutlineRecognizer:
-    """Proposes where the upright structure of a submap lies on that of older ones, from any direction.
+    """Proposes poses at which the upright structure of a submap matches older ones, from any viewing direction.
 
-    All poses that the drift allows are searched in the outlines of all older submaps together, as the graph has
-    them; what fits is refined in those single ones that it touches most.
+    All poses that the drift allows are searched in the combined outlines of all older submaps, at their poses in
+    the graph; each match is then refined in those individual outlines that it overlaps most.
     """
 
     def __init__(self, config: Config, dimension: int) -> None:
@@ -54,16 +54,16 @@ class OutlineRecognizer:
         self.outlines: list[Outline] = []
 
     def add(self, submap: Submap) -> None:
-        """Keep the outline of a submap."""
+        """Store the outline of a submap."""
         T_anchor_level = level_frame(submap.anchor, self.config.local_map)
         points = lie.transform(lie.inverse(T_anchor_level), submap.points())
         columns = upright_columns(points, self.config.local_map.voxel_size_m * submap.anchor.scale)
         self.outlines.append(Outline(submap.anchor.index, T_anchor_level, columns, KDTree(columns)))
 
     def query(self, query: Query) -> list[Candidate]:
-        """The best few of the poses that fit, each with the older submaps that it touches most.
+        """The best few of the poses that fit, each with the older submaps that it overlaps most.
 
-        Far from the expected pose one must not have a rival.
+        Far from the expected pose, a pose with a rival elsewhere is ambiguous.
         """
         newest, keyframes, limits = self.outlines[-1], query.keyframes, self.config.loops
         here, radius_m = query.submap.anchor, query.submap.radius_m
@@ -78,17 +78,17 @@ class OutlineRecognizer:
             return []
         within_m, fine_m = float(reach_m[near].max()), self.config.local_map.voxel_size_m * here.scale
         size_m = max(fine_m, 2.0 * within_m / _MAX_CELLS)
-        drawn = np.vstack([lie.transform(T_old[k], old[k].columns) for k in near.tolist()])
+        combined = np.vstack([lie.transform(T_old[k], old[k].columns) for k in near.tolist()])
         window = Window(T_expected, within_m, _HEADING_RAD)
         wanted = Wanted(_APART * size_m, _RIVAL, _POSES, _MIN_SHARE)
-        found = find(evenly(newest.columns, _COLUMNS), SearchGrid.of_points(drawn, size_m), window, wanted)
+        found = find(evenly(newest.columns, _COLUMNS), SearchGrid.of_points(combined, size_m), window, wanted)
         poses = np.array([each.T_target_source for each in found]).reshape(-1, 3, 3)
         candidates: list[Candidate] = []
         for T in poses:
-            beside = near[_away_m(T_old[near], T) <= radius_m].tolist()
-            T_targets = {k: lie.between(T_old[k], T) for k in beside}
-            touching = {k: _touching(newest.columns, old[k], T_targets[k], size_m) for k in beside}
-            for k in sorted(beside, key=lambda k: -touching[k])[:_TARGETS]:
+            adjacent = near[_away_m(T_old[near], T) <= radius_m].tolist()
+            T_targets = {k: lie.between(T_old[k], T) for k in adjacent}
+            touching = {k: _touching(newest.columns, old[k], T_targets[k], size_m) for k in adjacent}
+            for k in sorted(adjacent, key=lambda k: -touching[k])[:_TARGETS]:
                 drift_m = float(np.clip(limits.drift * path_m[k], limits.min_radius_m, limits.max_radius_m))
                 by, rival = Proposal.POSITION, -1
                 if _away_m(T, T_expected) > drift_m:
@@ -118,7 +118,7 @@ def _touching(columns: Points, outline: Outline, T: Pose, size_m: float) -> floa
 
 
 def _refined(columns: Points, outline: Outline, T: Pose, size_m: float, fine_m: float) -> Sequence[Found]:
-    """The pose near by that fits a single outline best, if any does."""
+    """The pose near ``T`` that fits a single outline best, if any does."""
     grid, around = SearchGrid.of_points(outline.columns, fine_m), Window(T, _REFINED * size_m, _REFINED_RAD)
     return find(evenly(columns, _COLUMNS), grid, around, Wanted(_APART * fine_m, 1.0, 1))
 

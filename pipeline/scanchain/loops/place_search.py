@@ -1,4 +1,4 @@
-"""Search for the newest keyframes in a map, or in older segments of a log, as long as nothing joins them there."""
+"""Search for the newest keyframes in a map, or in older segments of a log, until they are joined to it."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.registration.search import Found, Search
 
-_BACKOFF = 0.2  # path between two searches, as a share of what was searched in vain
+_BACKOFF = 0.2  # path between two searches, as a share of the path searched without result
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
 
-Map = TypeVar("Map")  # older keyframes as a search needs them
+Map = TypeVar("Map")  # older keyframes, preprocessed for a search
 Result = TypeVar("Result")
 Underway = Generator[None, None, Sequence[Closure]]
 
@@ -28,8 +28,8 @@ class Finder(Protocol[Map]):
     """Search for keyframes of a path among older ones, in the plane or in space.
 
     first_m, least_m, most_m : path of a segment before its first search, and least and largest between two
-    match_m : path between two matches with a map that a log is followed in, at full scale
-    searches, alike : number of searches so far, and of those that found several places alike
+    match_m : path between two matches with a map that a log is tracked in, at full scale
+    searches, alike : numbers of searches so far, and of those whose result was ambiguous
     """
 
     first_m: float
@@ -40,13 +40,13 @@ class Finder(Protocol[Map]):
     alike: int
 
     def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> Map:
-        """Draw older keyframes, whose ``T_odom_lidar`` is T_world_lidar; the folder of a map may keep a part."""
+        """Preprocess older keyframes, whose ``T_odom_lidar`` is T_world_lidar; a map's folder may cache it."""
         ...
 
     def find(self, keyframes: Sequence[Keyframe], start: int, target: Map) -> Underway:
-        """Closures of the newest keyframes, of the segment from ``start`` on, with older ones as drawn.
+        """Closures of the newest keyframes, of the segment from ``start`` on, with preprocessed older ones.
 
-        Yields where the work of one scan is done: by counts and not by the clock, so that results are the same on
+        Yields when the work for one scan is done: by counts and not by the clock, so that results are the same on
         any machine.
         """
         ...
@@ -55,7 +55,7 @@ class Finder(Protocol[Map]):
 class PlaceSearch(Generic[Map]):
     """Schedule of searches for the newest segment in a map or in older segments, one after the other.
 
-    In a large map a search goes on over several scans.
+    In a large map a search is spread over several scans.
     """
 
     def __init__(self, finder: Finder[Map], segments: Segments) -> None:
@@ -63,12 +63,12 @@ class PlaceSearch(Generic[Map]):
         self.of_map = 0  # number of the first keyframes that belong to a map
         self.turn = 0
         self.next_m = 0.0
-        self.matched_m = -math.inf  # path up to the last match with a map that the log is followed in
+        self.matched_m = -math.inf  # path up to the last match with a map that the log is tracked in
         self.underway: Underway | None = None
-        self.drawn: dict[bool, tuple[Matrix, Map]] = {}  # poses and drawing of a map, and of those drawn last
+        self.drawn: dict[bool, tuple[Matrix, Map]] = {}  # poses, preprocessed: of the map, of the last others
 
     def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None) -> None:
-        """Take the keyframes of a map, and draw it before its first search."""
+        """Add the keyframes of a map, and preprocess them before the first search."""
         self.of_map = len(keyframes)
         T_world = np.array([each.T_odom_lidar for each in keyframes])
         self.drawn[True] = T_world, self.finder.draw(keyframes, folder)
@@ -78,21 +78,21 @@ class PlaceSearch(Generic[Map]):
         self.matched_m = -math.inf
 
     def has_just_matched(self, keyframes: Sequence[Keyframe]) -> bool:
-        """True while the last match with the map lies so little behind the newest keyframe that none is due."""
+        """True while the last match with the map is so recent that no other one is due."""
         return self._since_m(keyframes) < self.finder.match_m * keyframes[-1].scale
 
     def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
-        """True while the last match with the map lies little behind the newest keyframe."""
+        """True while the last match with the map is recent."""
         return self._since_m(keyframes) <= _TRACKED_M
 
     def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
-        """Remember whether the newest keyframe, of these closures, matches the map."""
+        """Record whether the newest keyframe, which has these closures, matches the map."""
         accepted = (each for each in closures if each.verdict is ClosureVerdict.ACCEPTED)
         if any(each.target < self.of_map for each in accepted):
             self.matched_m = keyframes[-1].traveled_m
 
     def skip(self) -> None:
-        """End the search that is under way, if any: the newest keyframe matches the map."""
+        """Cancel the search in progress, if any: the newest keyframe matches the map."""
         self.underway = None
 
     def close(
@@ -105,7 +105,7 @@ class PlaceSearch(Generic[Map]):
         newest, start = keyframes[-1], self.segments.starts[-1]
         if newest.index == start:
             self.underway, self.next_m = None, newest.traveled_m + self.finder.first_m
-        old = self._sought(components, keyframes)
+        old = self._search_targets(components, keyframes)
         if not len(old):
             self.underway = None
         if not len(old) or self.underway is not None or newest.traveled_m < self.next_m:
@@ -115,12 +115,12 @@ class PlaceSearch(Generic[Map]):
         step_m = max(_BACKOFF * (newest.traveled_m - begun_m), self.finder.least_m)
         self.next_m = newest.traveled_m + min(step_m, self.finder.most_m)
         self.turn += 1
-        target = self._drawn(old, keyframes, graph.poses[old])
+        target = self._preprocessed(old, keyframes, graph.poses[old])
         self.underway = self.finder.find(keyframes[: newest.index + 1], start, target)
         return self.advance()
 
     def advance(self) -> tuple[Closure, ...]:
-        """Go on with the search that is under way, for a scan; closures once it is done."""
+        """Continue the search in progress by the work for one scan; returns its closures once it is done."""
         if self.underway is None:
             return ()
         try:
@@ -131,17 +131,17 @@ class PlaceSearch(Generic[Map]):
         return ()
 
     def finish(self) -> tuple[Closure, ...]:
-        """Complete the search that is under way, if any."""
+        """Complete the search in progress, if any."""
         closures: tuple[Closure, ...] = ()
         while self.underway is not None:
             closures = self.advance()
         return closures
 
-    def _sought(self, components: NDArray[np.int64], keyframes: Sequence[Keyframe]) -> NDArray[np.int64]:
-        """Keyframes among which the newest are sought: those of one of the components that they are not joined to.
+    def _search_targets(self, components: NDArray[np.int64], keyframes: Sequence[Keyframe]) -> NDArray[np.int64]:
+        """Keyframes to search for the newest: those of one of the components that they are not joined to.
 
         Components take turns: two may show the same location. Keyframes that are joined to all others but have not
-        matched the map for a while are searched for in it again: they may have been joined where they are not.
+        matched the map for a while are searched for in it again: they may have been joined at a wrong pose.
         """
         unknown = np.flatnonzero(components != components[-1])
         if not len(unknown):
@@ -149,8 +149,8 @@ class PlaceSearch(Generic[Map]):
         numbers = np.unique(components[unknown])
         return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
 
-    def _drawn(self, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> Map:
-        """Older keyframes as drawn at these poses; they are drawn once as long as they lie as they did."""
+    def _preprocessed(self, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> Map:
+        """Older keyframes, preprocessed at these poses; cached as long as the poses stay the same."""
         for T_drawn, target in self.drawn.values():
             if np.array_equal(T_drawn, T_world):
                 return target
@@ -163,7 +163,7 @@ class PlaceSearch(Generic[Map]):
 
 
 def searched(search: Search) -> Generator[None, None, Sequence[Found]]:
-    """The poses that a search finds, in slices of equal work, one a scan."""
+    """The poses that a search finds, in slices of equal work, one per scan."""
     search.advance()
     while not search.is_done:
         yield
@@ -172,7 +172,7 @@ def searched(search: Search) -> Generator[None, None, Sequence[Found]]:
 
 
 def completed(underway: Generator[None, None, Result]) -> Result:
-    """The result of a search that no scan waits for."""
+    """The result of a search that is completed at once."""
     while True:
         try:
             next(underway)

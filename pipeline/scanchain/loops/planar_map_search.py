@@ -24,15 +24,15 @@ from scanchain.registration import SearchGrid, Wanted
 from scanchain.registration.search import Search, draw_surfaces
 
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
-_CERTAIN = 0.6  # log-odds of occupancy, from which on a cell is a surface, and below minus which it is free
+_CERTAIN = 0.6  # log-odds of occupancy above which a cell is a surface, and below minus which it is free
 _POINTS, _MORE_POINTS = 120, 800  # number of points that poses are searched with and compared with
 _APART_M, _APART_RAD = 1.0, 0.2  # least distance of two distinct poses
 _ANSWERS = 12  # largest number of poses that are compared
-_RIVAL = 0.75  # share of the best score, from which on a pose elsewhere makes it ambiguous
-LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
-_CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
-_CERTAINLY = 0.06  # share above that, from which on a place is taken for found
-_CLEAR_M = 2.0  # path since a search that fitted several places, from which on a place is taken for found
+_RIVAL = 0.75  # share of the best score above which a pose elsewhere makes it ambiguous
+LEAST_SHARE = 0.35  # of the highest possible score: wrong poses of long paths reach it
+_CHANCE = 2.0  # over the root of the number of points: share above LEAST_SHARE that is reached by chance
+_CERTAINLY = 0.06  # least share above these for a location to count as found
+_CLEAR_M = 2.0  # least path since an ambiguous search for a location to count as found
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest distance of an aligned scan from where its path was found
 _SOURCES, _SUBMAPS = 8, 6  # keyframes of the path that are aligned, about 1 m apart, and submaps tried for each
@@ -43,7 +43,7 @@ _NEAR_M = 8.0  # largest distance of such a submap's anchor
 class Hypothesis:
     """A pose of the lidar in the map, and the mean score of its points as a share of the highest possible.
 
-    ``rival`` is the share of the best pose elsewhere, 0 where none comes near; ``points`` is one a cell.
+    ``rival`` is the share of the best pose elsewhere, 0 if none comes near; ``points`` counts one per cell.
     """
 
     T_map_lidar: Pose
@@ -74,12 +74,12 @@ class Hypothesis:
 class PlanarMapSearch:
     """Surfaces and free space of keyframes at their poses, in a grid in which all poses of a scan are searched.
 
-    A point of the scan scores 1 on a surface, ½ beside it, −1 in free space and nothing where the map knows
-    nothing, and the lidar itself stands in free space: a pose that fits walls but looks through others scores low.
+    A point of the scan scores 1 on a surface, ½ next to it, −1 in free space and 0 in unknown space, and the lidar
+    itself has to be in free space: a pose that fits walls but sees through others scores low.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], resolution_m: float) -> None:
-        """Draw keyframes, whose ``T_odom_lidar`` is T_map_lidar."""
+        """Rasterize keyframes, whose ``T_odom_lidar`` is T_map_lidar."""
         self.keyframes, clouds = keyframes, [keyframe.points for keyframe in keyframes]
         T_map_lidar = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
         reach_m = max(float(np.abs(cloud).max(initial=0.0)) for cloud in clouds)
@@ -97,7 +97,7 @@ class PlanarMapSearch:
         self.grid = SearchGrid(cells, grid.origin_m - self.resolution_m, self.resolution_m, room)
 
     def sought(self, points: Points, least: float = LEAST_SHARE) -> Generator[None, None, Hypothesis | None]:
-        """The pose that the points (N, 2), lidar frame, fit best; None where none has the least share.
+        """The pose that the points (N, 2), lidar frame, fit best; None if none has the least share.
 
         Poses are searched with some of the points, in slices of equal work; those found are compared with more.
         """
@@ -113,16 +113,16 @@ class PlanarMapSearch:
         return Hypothesis(best.T_target_source, best.share, max(apart, default=0.0), len(points))
 
     def likely(self, path: Sequence[Keyframe]) -> Hypothesis | None:
-        """The pose of the middle keyframe of a path that its points fit best; None where they fit none."""
+        """The pose of the middle keyframe of a path that its points fit best; None if they fit none."""
         T_middle_odom = lie.inverse(path[len(path) // 2].T_odom_lidar)
         best = completed(self.sought(seen_together(path, T_middle_odom)))
         return best if best is not None and best.is_likely else None
 
 
 class PlanarFinder:
-    """Points of the last part of a path, sought in the drawing of older keyframes; then scans are aligned there.
+    """Search of rasterized older keyframes for the points of the end of a path; then scans are aligned there.
 
-    A pose is taken where it fits far better than chance and none elsewhere nearly as well, nor did shortly before.
+    A pose is accepted if it fits far better than chance, and no other fits nearly as well, now or shortly before.
     """
 
     first_m, least_m, most_m = 1.0, 0.5, 2.0
@@ -131,7 +131,7 @@ class PlanarFinder:
     def __init__(self, submaps: VoxelSubmaps, verifier: Verifier) -> None:
         self.submaps = submaps
         self.verifier = verifier
-        self.ambiguous_m = -math.inf  # path up to the last search that fitted several places
+        self.ambiguous_m = -math.inf  # path up to the last ambiguous search
         self.searches = self.alike = 0
 
     def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> PlanarMapSearch:
@@ -160,7 +160,7 @@ class PlanarFinder:
     def aligned(
         self, source: Keyframe, T_world_source: Pose, anchors: Sequence[Keyframe], keyframes: Sequence[Keyframe]
     ) -> Closure | None:
-        """The closure of a keyframe to the submap near by that it overlaps most; None where there is none.
+        """The closure of a keyframe to the nearby submap that it overlaps most; None if there is none.
 
         anchors : of submaps out of ``keyframes``; their ``T_odom_lidar`` is T_world_lidar
         """
@@ -181,7 +181,7 @@ class PlanarFinder:
 
 
 def _are_apart(T: Pose, T_other: Pose) -> bool:
-    """True for two poses that are not the same."""
+    """True for two distinct poses."""
     away_m = np.abs(T[:2, 2] - T_other[:2, 2]).max()
     return bool(away_m >= _APART_M or lie.apart(T, T_other)[1] >= _APART_RAD)
 

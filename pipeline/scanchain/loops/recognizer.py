@@ -1,4 +1,4 @@
-"""Place recognition: the protocol of recognizers, and loop closures of what they propose, once verified."""
+"""Place recognition: the protocol of recognizers, and loop closures from their verified proposals."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Candidate:
     score : similarity, comparable between candidates of one recognizer; the larger the better
     proposed_by : appearance alone (``PLACE``) or together with the expected pose (``POSITION``); the latter is not
         tried where the target lies in another segment than the queried keyframe
-    rival : another keyframe as similar elsewhere, which makes the candidate ambiguous, or −1
+    rival : keyframe elsewhere that is as similar, which makes the candidate ambiguous, or −1
     """
 
     target: int
@@ -65,7 +65,7 @@ class Recognizer(Protocol):
     """Database of submaps that proposes which of them a new one revisits.
 
     A checkpoint does not hold it: a resumed run makes a new one from its name and adds the same submaps again, in
-    the same order. It goes on to the same result if ``query`` changes nothing that a later result depends on.
+    the same order. It reaches the same result if ``query`` changes nothing that a later result depends on.
     """
 
     def __init__(self, config: Config, dimension: int) -> None:
@@ -98,13 +98,13 @@ def create_recognizer(config: Config, dimension: int) -> Recognizer | None:
 
 
 class PlaceCloser:
-    """Loop closures by the recognizer, queried for one keyframe of every few.
+    """Loop closures from the recognizer, which is queried for one of every few keyframes.
 
-    A submap is complete once the lidar has gone on by its radius.
+    A submap is complete once the lidar has moved on by its radius.
     """
 
     def __init__(self, config: Config, dimension: int, submaps: VoxelSubmaps, verifier: Verifier) -> None:
-        """Submaps : that scans are aligned to in the plane; in 3D two submaps are aligned."""
+        """Scans are aligned to the ``submaps`` in 2D; in 3D two submaps are aligned."""
         self.config = config
         self.dimension = dimension
         self.submaps = submaps
@@ -117,9 +117,9 @@ class PlaceCloser:
         self.last: Closure | None = None
 
     def begin_in(self, keyframes: Sequence[Keyframe], *, are_added: bool = True) -> float:
-        """Begin behind the keyframes of a map; the path, in meters, from which on all of them are candidates.
+        """Start after the keyframes of a map; returns the path, in meters, beyond which all are candidates.
 
-        are_added : whether places of the map are recognized here
+        are_added : whether the submaps of the map are added to the recognizer
         """
         if self.recognizer is not None and are_added:
             for anchor in self._anchors(keyframes, finish=True):
@@ -145,7 +145,7 @@ class PlaceCloser:
     ) -> tuple[Closure, ...]:
         """Closures of the submaps that are complete by now, accepted or not; with ``finish``, of all others, too.
 
-        keyframes : all so far; graph : their best known poses, and how sure they are
+        keyframes : all so far; graph : their best known poses, with covariances
         connected : (K,) keyframes in the component of the newest
         """
         recognizer = self._recognizer(keyframes)
@@ -185,7 +185,7 @@ class PlaceCloser:
         graph: PoseGraph,
         connected: NDArray[np.bool_],
     ) -> Iterator[Closure]:
-        """The first that is accepted, after those that are not."""
+        """Closures of the candidates, up to the first one that is accepted."""
         submap, T_world = self._submap(anchor, keyframes), graph.poses
         recognizer.add(submap)
         self.added.append(anchor.index)
@@ -215,7 +215,7 @@ class PlaceCloser:
         return self.config.loops.place_radius_m * anchor.scale
 
     def _expected(self, anchor: Keyframe, keyframes: Sequence[Keyframe], T_world: Matrix) -> Pose:
-        """T_world_anchor by odometry since the last closure; that one may not have moved the map yet."""
+        """T_world_anchor by odometry since the last closure, which may not have corrected the graph yet."""
         if self.last is None:
             return T_world[anchor.index]
         T_last_anchor = lie.between(keyframes[self.last.source].T_odom_lidar, anchor.T_odom_lidar)
@@ -226,7 +226,7 @@ class PlaceCloser:
         return f"loops.recognizer {self.config.loops.recognizer}"
 
     def _check(self, candidate: Candidate, query: Query) -> None:
-        """Refuse what is no candidate, and a candidate that is out of range."""
+        """Raise InputError for an object that is no candidate, or a candidate out of range."""
         if not isinstance(candidate, Candidate):
             raise InputError(
                 f"{self._named}: query returned {shown(candidate)} among its candidates; wanted "
@@ -257,9 +257,9 @@ class PlaceCloser:
     def _problem(
         self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None
     ) -> Problem | None:
-        """Why an aligned candidate is no closure, None if it is one.
+        """Why an aligned candidate is rejected, None if it is accepted.
 
-        graph : None between unconnected keyframes, where the distance that odometry has them apart means nothing
+        graph : None between unconnected keyframes, whose distance by odometry is meaningless
         """
         limits, anchor = self.config.loops, query.submap.anchor
         if candidate.rival >= 0:
@@ -280,5 +280,5 @@ class PlaceCloser:
         return Problem(
             "far from the prediction",
             f"{moved_m:.1f} m from the prediction, more than {100.0 * _PLACE_DRIFT:g} % of the path between and "
-            f"than {_PLACE_SIGMAS:g} of its standard deviations ({sigma_m:.1f} m)",
+            f"more than {_PLACE_SIGMAS:g} standard deviations ({sigma_m:.1f} m)",
         )

@@ -20,16 +20,16 @@ from scanchain.registration.plicp import settings_of
 from scanchain.threads import threads
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # step below which another iteration would change little
-_MAX_SCANS = 2048  # largest number of scans of a thread in memory
+_MAX_SCANS = 2048  # largest number of scans per thread in memory
 
 
 def spread(
     T_world_keyframes: Matrix, scan_indices: NDArray[np.int64], odometry: Matrix, starts: Sequence[int] = ()
 ) -> Matrix:
-    """World poses (N, d+1, d+1) of all scans: each keyframe's correction, blended between it and the next.
+    """World poses (N, d+1, d+1) of all scans: odometry, with the corrections between keyframes interpolated.
 
     scan_indices : (K,) of the keyframes, the first of them 0; odometry : (N, d+1, d+1) T_odom_lidar
-    starts : keyframes to which the motion is unknown, so that nothing is blended before them
+    starts : keyframes to which the motion is unknown, so that nothing is interpolated before them
     """
     following = np.append(np.arange(1, len(scan_indices)), -1)
     relative = lie.between(odometry[scan_indices], odometry[scan_indices[following]])
@@ -53,7 +53,7 @@ def refined(
 ) -> Matrix:
     """T_world_lidar (N, 3, 3) of all scans, each aligned once more to the map of all keyframes.
 
-    In directions that the map does not constrain, the prior of an edge of odometry keeps a pose where it is.
+    In directions that the map does not constrain, a prior as uncertain as an odometry edge keeps a pose unchanged.
     spans : (N, 2) first row and number of each scan's points in the store
     keyframes, T_world_keyframes : of the map
     """
@@ -72,7 +72,7 @@ def refined(
         refine(surfaces.voxels, points, starts, result[part], prior, least_share, settings)
 
     count = threads()
-    with ThreadPoolExecutor(count) as pool:  # no scan depends on another, and kernels let others run
+    with ThreadPoolExecutor(count) as pool:  # scans are independent, and kernels release the GIL
         for first in range(0, len(poses), count * _MAX_SCANS):
             parts = [slice(first + k * _MAX_SCANS, first + (k + 1) * _MAX_SCANS) for k in range(count)]
             clouds = [_points_of(spans[part], store) for part in parts]
@@ -88,7 +88,7 @@ def _points_of(spans: NDArray[np.int64], store: PointStore) -> Points:
 
 
 def _map_of(T_world_keyframes: Matrix, keyframes: Sequence[Keyframe], config: Config) -> VoxelMap:
-    """All keyframes in a map that forgets nothing."""
+    """A voxel map of all keyframes that never removes voxels."""
     whole = msgspec.structs.replace(config.local_map, max_distance_m=inf, max_insertions=len(keyframes) + 1)
     result = VoxelMap(2, whole, noise_m=max(keyframe.noise_m for keyframe in keyframes))
     for keyframe, T_world_lidar in zip(keyframes, T_world_keyframes, strict=True):

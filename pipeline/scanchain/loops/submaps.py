@@ -1,4 +1,4 @@
-"""Submaps: the scans around a keyframe in its frame, as points or as voxels, and where up is in it."""
+"""Submaps: the scans around a keyframe in its frame, as points or as voxels, and the vertical direction in it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from scanchain.registration import VoxelMap
 
 RADII_AHEAD = 1.0  # radii of the trajectory after the anchor that a submap takes in
 RADII_BEHIND = 2.0  # radii of the trajectory before it: a lidar that looks ahead sees a location from far off
-_MAX_POINTS = 80_000  # largest number of points of a submap, of keyframes evenly spread over it
-_OF_MAP = 2  # times as many keyframes in a submap of a map, which was seen from several sides
+_MAX_POINTS = 80_000  # largest number of points of a submap, from keyframes evenly spread over it
+_OF_MAP = 2  # factor on the number of keyframes in a submap of a map, which was seen from several sides
 _MAX_CACHED = 64  # largest number of voxel submaps in memory; the least recently used one is dropped first
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
 _MIN_GROUND_VOXELS = 10  # least number of voxels with such a normal; with fewer the lidar is assumed upright
@@ -29,9 +29,9 @@ _MIN_GROUND_VOXELS = 10  # least number of voxels with such a normal; with fewer
 
 @dataclass(frozen=True, slots=True)
 class Submap:
-    """The keyframes around an ``anchor``, in the order they were taken, cropped to a radius around it.
+    """The keyframes around an ``anchor``, in the order of the log, cropped to a radius around it.
 
-    Odometry places them; over so short a path it is as good as any pose known later.
+    Their relative poses are from odometry, which over such a short path is as good as any later estimate.
     """
 
     anchor: Keyframe
@@ -39,7 +39,7 @@ class Submap:
     radius_m: float
 
     def views(self, count: int) -> Iterator[tuple[Pose, Points]]:
-        """T_anchor_lidar and points (N, d) in the lidar's frame of so many members at most, evenly spread."""
+        """T_anchor_lidar and points (N, d) in the lidar's frame of at most ``count`` members, evenly spread."""
         T_anchor_odom = lie.inverse(self.anchor.T_odom_lidar)
         for member in self.members[:: max(-(-len(self.members) // count), 1)]:
             yield T_anchor_odom @ member.T_odom_lidar, member.points
@@ -53,7 +53,7 @@ class Submap:
 
 
 def seen_together(keyframes: Sequence[Keyframe], T_frame_odom: Pose) -> Points:
-    """Points (N, d) of keyframes in a frame that odometry places: one scan alone may fit at many poses."""
+    """Combined points (N, d) of keyframes in one frame, by odometry: a single scan may fit at many poses."""
     return np.vstack([lie.transform(T_frame_odom @ each.T_odom_lidar, each.points) for each in keyframes])
 
 
@@ -74,7 +74,7 @@ class VoxelSubmaps:
     """Voxel maps of 2n + 1 keyframes around every n-th one, built when first used.
 
     They lie in that keyframe's frame, with voxels of the size that odometry used there; keyframes of another
-    segment are left out. Of a map, whose poses are known, those nearest to the keyframe are taken, of any pass.
+    segment are left out. In a map, whose poses are known, the keyframes nearest to it are used, of any pass.
     """
 
     def __init__(self, dimension: int, half_width: int, config: LocalMapConfig, segments: Segments) -> None:
@@ -86,7 +86,7 @@ class VoxelSubmaps:
         self.cached: OrderedDict[tuple[int, int], VoxelMap] = OrderedDict()
 
     def begin_in(self, keyframes: Sequence[Keyframe]) -> None:
-        """Take the keyframes of a map."""
+        """Add the keyframes of a map."""
         self.of_map = KDTree(np.array([keyframe.T_odom_lidar[:-1, -1] for keyframe in keyframes]))
 
     def anchor_of(self, keyframe: int) -> int:
@@ -134,8 +134,8 @@ class VoxelSubmaps:
 def level_frame(keyframe: Keyframe, config: LocalMapConfig) -> Pose:
     """T_keyframe_level (4, 4), the frame with the same origin whose z axis is normal to the ground.
 
-    The ground is what is planar and lies at less than 32° to the lidar's own horizon; where there is too little
-    of it, the lidar is assumed upright. The x axis is as near to the lidar's as it can be.
+    The ground is what is planar and inclined by less than 32° to the lidar's xy plane; where there is too little
+    of it, the lidar is assumed upright. The x axis is as close to the lidar's as possible.
     """
     voxels = VoxelMap(3, config, keyframe.scale, keyframe.noise_m)
     voxels.insert(keyframe.points, lie.identity(3))

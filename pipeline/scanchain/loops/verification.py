@@ -1,6 +1,6 @@
 """Verification of a proposed loop closure: alignment from the initial pose, and tests of the result.
 
-A scan is aligned to a voxel submap or, in 3D, a submap to a submap, which are then checked for free space, too.
+A scan is aligned to a voxel submap or, in 3D, a submap to a submap, whose free space is then compared, too.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from scanchain.preprocess import downsample
 from scanchain.registration import PointToShapeMatcher, VoxelMap
 
 _MIN_OVERLAP_ALONE = 0.8  # least overlap of a match that no expected pose supports
-_MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # least of a recognized place, as loops.min_… of others
+_MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # for recognized places, instead of loops.min_…
 _MIN_AGREEMENT = 0.87  # least agreement about free space, relative to that of each submap with itself
-_COARSE = 2.0  # voxel size, in usual ones, of the first alignment of two submaps
+_COARSE = 2.0  # voxel size of the first alignment of two submaps, in usual voxel sizes
 _VIEWS = 8  # number of views of each submap that are compared with the other
 _VERIFIED = "verified by matching"
 _BINS = (90, 180)  # bins of elevation and azimuth: 2° each
@@ -35,9 +35,9 @@ class Verification:
 
     match : of the source's points to the target's surfaces, T_target_source between the two anchors
     overlap : share of the source's points within a voxel of the target's surfaces
-    problem : why it is no loop closure, None if it is one
-    agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both
-        directions, divided by the share that either submap has with itself; 1 where not compared
+    problem : why it is rejected, None if it is accepted
+    agreement : share of the points in view of the other's lidar that lie on surfaces it saw, the smaller one
+        of both directions, divided by that of the submaps with themselves; 1 where not compared
     """
 
     match: Match
@@ -53,7 +53,7 @@ class Verification:
         *,
         problem: Problem | None = None,
     ) -> Closure:
-        """The closure of two keyframes; a ``problem`` besides those of the alignment rejects it, too."""
+        """The closure of two keyframes; a ``problem`` in addition to those of the alignment rejects it."""
         problem = self.problem or problem
         verdict = ClosureVerdict.REJECTED if problem else ClosureVerdict.ACCEPTED
         cause, reason = problem or (_VERIFIED, _VERIFIED)
@@ -61,7 +61,7 @@ class Verification:
 
 
 class Verifier:
-    """Aligns a scan to a voxel submap or, in 3D, a submap to a submap, and judges the result."""
+    """Aligns a scan to a voxel submap or, in 3D, a submap to a submap, and tests the result."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -72,8 +72,8 @@ class Verifier:
     ) -> Verification:
         """A keyframe's scan in a submap, from an initial pose.
 
-        alone : whether nothing but the match supports the closure, which must overlap more then
-        in_map : whether the source is followed in a map, where it needs no more information than a scan does
+        alone : whether only the match supports the closure, which then needs more overlap
+        in_map : whether the source is tracked in a map, where a match that is not degenerate is informative enough
         """
         limits = self.config.loops
         points = downsample(source.points, target.scale * self.config.preprocess.match_voxel_m)
@@ -94,7 +94,7 @@ class Verifier:
     ) -> Verification:
         """A submap in another, from an initial pose: aligned from coarse to fine, free space compared.
 
-        min_agreement : least agreement about free space; less where the place may have changed
+        min_agreement : least agreement about free space; lower where the surroundings may have changed
         """
         scale = source.anchor.scale
         fine_m = scale * self.config.preprocess.match_voxel_m
@@ -144,17 +144,17 @@ def _too_uncertain(match: Match, least: float, key: str = "") -> Problem | None:
 
 
 def _below(name: str, figure: str, value: float, least: float, key: str = "") -> Problem | None:
-    """A figure below the limit of this key, or of a recognized place; None where it is not."""
+    """The problem of a value below the limit of this key, or for recognized places; None if it is not below."""
     if value >= least:
         return None
-    limit = f"{key or 'the least of a recognized place'} ({least:g})"
+    limit = f"{key or 'the limit for a recognized place'} ({least:g})"
     return Problem(f"{name} < {key or limit}", f"{name} {figure} < {limit}")
 
 
 def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, margin_m: float) -> float:
     """Share, of the source's points in view of the target's lidar, that lie where it saw a surface.
 
-    points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 where nothing was in sight.
+    points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 if no point is in view.
     """
     ranges_m, points = np.empty(_BINS), np.ascontiguousarray(points)
     agreeing = contradicting = 0

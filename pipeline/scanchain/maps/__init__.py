@@ -1,4 +1,4 @@
-"""Maps of the world: a point cloud and an occupancy grid, written in formats others read."""
+"""Maps of the world: a point cloud and an occupancy grid, written in common formats."""
 
 from scanchain.maps.files import read_map, read_ply, write_laz, write_map, write_pcd, write_ply
 from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_resolution

@@ -1,8 +1,8 @@
 """Files of maps: point clouds as PLY, PCD and LAZ, occupancy grids as the map.pgm and map.yaml of map_server.
 
 PLY: Turk 1994. PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. LAZ by laspy, whose
-decoder aborts or hangs on damage: ``python -m scanchain.maps.files FILE POINTS`` is the process that it gets.
-Points of the plane lie at z = 0.
+decoder aborts or hangs on damage and so runs in its own process: ``python -m scanchain.maps.files FILE POINTS``.
+2D points are written with z = 0.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ VIEWPOINT 0 0 0 1 0 0 0
 POINTS {count}
 DATA binary
 """
-_SCALE_M = 0.001  # LAZ holds whole multiples of it
+_SCALE_M = 0.001  # LAZ coordinates are whole multiples of it
 _LAS_S, _LAS_S_PER_MIB = 30.0, 1.0  # largest time to decode a file; a MiB takes about 0.05 s
 _LAS_MIB, _LAS_TIMES = 1024.0, 100.0  # largest memory, and times the size of the file
 
 _PGM = re.compile(rb"P5\n(\d+) (\d+)\n255\n(.*)", re.DOTALL)
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # pixels of ROS's map_saver
-# Thresholds that sort exactly these three pixels, p = (255 − pixel) / 255, as nav2's own saver writes them: with
+# Thresholds that select exactly these three pixels, p = (255 − pixel) / 255, as nav2's own saver writes them: with
 # the common free_thresh 0.25 the unknown pixel, p = 0.196, would be read as free.
 _YAML = """image: map.pgm
 mode: trinary
@@ -119,7 +119,7 @@ def read_las(path: Path) -> Points:
 
 
 def _decode_las(path: Path, points: Path) -> None:
-    """Write the points of a LAS or LAZ file into another, as this process alone."""
+    """Write the points of a LAS or LAZ file to a .npy file: the work of the decoding process."""
     import laspy
 
     die_first()
@@ -151,7 +151,7 @@ def read_map(folder: Path | str) -> tuple[NDArray[np.int8], float, tuple[float, 
     """Cells (rows, columns) of a map that ``write_map`` wrote, the resolution in meters and the origin's x, y.
 
     Cells are 0 free, 100 occupied, −1 unknown; row 0 has the lowest y. Raises InputError where a file is missing
-    or of another make.
+    or was not written by ``write_map``.
     """
     folder = Path(folder)
     try:

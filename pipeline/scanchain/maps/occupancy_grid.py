@@ -1,4 +1,4 @@
-"""An occupancy grid that scans are drawn into one after the other."""
+"""An occupancy grid into which scans are inserted one after the other."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
 FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown
 MAX_CELLS = 64_000_000  # largest number of cells: half a gigabyte
 
-_HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, . 5.1
+_HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, sec. 5.1
 _LOW, _HIGH = -2.0, 3.5
-_MARGIN = 2  # cells around everything that is drawn; rounding may put a beam one cell aside
+_MARGIN = 2  # cells around all beams; rounding may shift a beam by one cell
 _LARGEST = 1e300  # m², of squared ranges
 _GROWTH = 0.25  # share of the extent that is added where the grid has to grow
 
@@ -27,13 +27,13 @@ _GROWTH = 0.25  # share of the extent that is added where the grid has to grow
 class OccupancyGrid:
     """Log-odds of occupancy over the xy plane of the world; grows as scans come in.
 
-    2D scans are drawn as they are. Of 3D scans the returns count that lie between ``slice_min_z_m`` and
-    ``slice_max_z_m`` above the lidar, along the world's z. Returns beyond ``grid_max_range_m`` do not count.
+    2D scans are inserted as they are; of 3D scans, only the returns between ``slice_min_z_m`` and
+    ``slice_max_z_m`` above the lidar, along the world's z. Returns beyond ``grid_max_range_m`` are ignored.
 
     resolution_m : edge of a cell
     origin_m : (2,) outer corner of cell (0, 0), the one of least x and y
     log_odds : (rows, columns) float32, row along y; 0 where nothing was seen
-    drawn : (rows, columns) number of the last scan that was seen in a cell, from 1; 0 for none
+    drawn : (rows, columns) number of the last scan that observed a cell, from 1; 0 for none
     """
 
     def __init__(self, config: MapsConfig) -> None:
@@ -45,11 +45,11 @@ class OccupancyGrid:
         self.scans = 0
 
     def insert(self, T_world_lidar: Pose, points: NDArray[np.floating]) -> None:
-        """Draw one scan: points (N, d), meters, lidar frame."""
+        """Insert one scan: points (N, d), meters, lidar frame."""
         self.insert_batch(T_world_lidar[None], points, np.array([0, len(points)]))
 
     def insert_batch(self, poses: Matrix, points: NDArray[np.floating], offsets: NDArray[np.int64]) -> None:
-        """Draw K scans: poses (K, d+1, d+1), points (N, d) of all of them, scan k from offsets[k] to [k + 1]."""
+        """Insert K scans: poses (K, d+1, d+1), points (N, d) of all of them, scan k from offsets[k] to [k + 1]."""
         if not len(poses):
             return
         beams = [
@@ -69,7 +69,7 @@ class OccupancyGrid:
     def _beams_in_slice(self, T: Pose, points: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
         """Start and end (M, 2), world, of the part of each beam of a scan that lies in the slice.
 
-        A beam runs straight from the lidar to its return, at a height z above it. Where the slice does not hold
+        A beam runs straight from the lidar to its return, at a height z above it. Where the slice does not contain
         the lidar's height, it starts where it enters the slice: at the share limit / z of its length.
         """
         squares = sum(column * column for column in points.T)
@@ -102,7 +102,7 @@ class OccupancyGrid:
     def _cover(self, extent: NDArray[np.float64]) -> None:
         """Grow the grid, by whole cells, so that it holds the extent (min x, min y, max x, max y) and a margin."""
         if not np.isfinite(extent).all():
-            raise InputError("a scan drawn into the grid has a pose or a point that is not finite")
+            raise InputError("a scan inserted into the grid has a pose or a point that is not finite")
         size = np.array(self.log_odds.shape[::-1])
         if not size.size or not size.all():
             self.origin_m = np.floor(extent[:2] / self.resolution_m) * self.resolution_m

@@ -1,4 +1,4 @@
-"""A point cloud of the world with one point a voxel, and what moved in it: points that other scans saw through."""
+"""A point cloud of the world with one point per voxel, and moving points in it: those that scans saw through."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _FIRST_VOXELS = 1 << 14
 
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
 _REACH_BINS = 1.5  # width of a bin in voxels at the farthest range that a scan is used to
-_CUBES_TO_REACH = 8.0  # cubes that points are sorted by, along the reach
+_CUBES_TO_REACH = 8.0  # number of cubes along the reach, by which points are sorted
 _WINDOW = 0.6  # share of a scan's spacing, within which a surface has a point
-_RANGE_MARGIN_SHARE = 0.03  # share of a range by which two may differ, beside one voxel
-_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # flatness assumed of the ground in voxels, error of an elevation
+_RANGE_MARGIN_SHARE = 0.03  # share of a range by which two may differ, plus one voxel
+_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # assumed flatness of the ground in voxels, error of an elevation
 _LEAST_THROUGH = 2  # least number of scans that saw through what moved
 _MAJORITY = 1.5  # least ratio of scans that saw through to scans that saw a surface there
-_ENOUGH = 12  # number of scans that saw a surface, for which it stays
+_ENOUGH = 12  # number of scans that saw a surface for which it is retained
 _EVERY = np.iinfo(np.int32).max  # a limit that no number of scans reaches
 
 
 class PointMap:
-    """Scans added up in the world frame; each voxel keeps the mean of its points.
+    """Scans accumulated in the world frame; each voxel keeps the mean of its points.
 
     voxel_size_m : edge of a voxel; doubled each time that ``max_voxels`` of them do not suffice, or that a point
-        lies a million of them from the first scan
+        is a million of them away from the first scan
     dimension : 2 or 3, of the points
     """
 
@@ -78,7 +78,7 @@ class PointMap:
         return self.sums[: self.used] / self.counts[: self.used, None]
 
     def _make_room(self) -> None:
-        """Double the rows or, where that is too many or the keys do not reach, the size of the voxels."""
+        """Double the rows or, if that is too many or the keys do not suffice, the size of the voxels."""
         sums, counts = self.sums[: self.used], self.counts[: self.used]
         if self.used == len(self.counts) < self.max_voxels:
             self._allocate(min(2 * len(self.counts), self.max_voxels))
@@ -108,7 +108,7 @@ def build_point_map(
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A scan with the ranges of its free space.
+    """A scan whose free space is compared with a map.
 
     T_world_lidar : (d+1, d+1)
     points : (M, d) meters, lidar frame
@@ -121,9 +121,9 @@ class View:
 
 
 def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray[np.bool_]:
-    """True for points (N, d) of a map, one a voxel, that clearly more scans saw through than saw a surface there.
+    """True for points (N, d) of a map, one per voxel, that clearly more scans saw through than saw a surface.
 
-    A surface that many scans saw stays, whatever others did: what stood there for long is part of the place.
+    A surface that many scans saw is retained in any case: what stood there for long is part of the map.
     """
     seen, seen_through = sightings(voxels, voxel_size_m, views, enough=_ENOUGH)
     return clearly_through(seen, seen_through) & (seen < _ENOUGH)
@@ -142,15 +142,15 @@ def reach_of(voxel_size_m: float) -> float:
 def sightings(
     voxels: Points, voxel_size_m: float, views: Iterable[View], *, enough: int = _EVERY
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Numbers of scans that saw a surface at each point (N, d) of a map, one a voxel, and that saw through it.
+    """Numbers of scans that saw a surface at each point (N, d) of a map, one per voxel, and that saw through it.
 
-    enough : a point that so many scans saw is not tested again
+    enough : a point that this many scans saw is not tested again
     """
     index = _Cells(lie.lift_points(voxels), reach_of(voxel_size_m))
     seen, seen_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
     count = threads()
-    with ThreadPoolExecutor(count) as pool:  # no point depends on another, and kernels let others run
+    with ThreadPoolExecutor(count) as pool:  # points are independent, and kernels release the GIL
         for view in views:
             nearest_ranges(lie.lift_points(view.points), ranges_m)
             T_world_lidar = lie.lift(view.T_world_lidar)
@@ -173,7 +173,7 @@ def sightings(
 
 
 class _Cells:
-    """Points sorted by cubes, so that a scan tests those within reach alone, and neighbors in turn."""
+    """Points sorted by cubes, so that a scan tests only those within reach, and neighbors in sequence."""
 
     def __init__(self, points: Points, reach_m: float) -> None:
         self.reach_m = reach_m
@@ -186,7 +186,7 @@ class _Cells:
         self.middles_m = (cubes[first] + 0.5) * self.edge_m
         self.spans = np.column_stack([first, np.append(first, len(points))[1:]])
 
-    def within_reach(self, place_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    def within_reach(self, position_m: NDArray[np.float64]) -> NDArray[np.int64]:
         """(S, 2) spans of the points in cubes that are, in part, within reach of a position."""
-        outside_m = np.maximum(np.abs(self.middles_m - place_m) - 0.5 * self.edge_m, 0.0)
+        outside_m = np.maximum(np.abs(self.middles_m - position_m) - 0.5 * self.edge_m, 0.0)
         return self.spans[np.einsum("ij,ij->i", outside_m, outside_m) <= self.reach_m**2]

@@ -5,8 +5,8 @@
     keyframes.npz  poses (K, d+1, d+1) T_map_lidar; stamps_ns, scan_index, session, traveled_m, scale, count,
                    step_m and is_wide (K,)
     edges.npz      pairs (E, 2), measurements (E, d+1, d+1), information (E, k, k), is_loop, weight (E,)
-    points.i16     of one keyframe after the other the coordinates (count, d) as int16, where it is_wide as int32,
-                   little-endian, times its step_m
+    points.i16     coordinates (count, d) of one keyframe after the other, in units of its step_m; little-endian
+                   int16, or int32 where it is_wide
 
 Points stay on disk and are read keyframe by keyframe. Maps of version 1 had no checksums and are refused.
 """
@@ -35,9 +35,9 @@ _ROW = np.dtype([
     ("scan_index", np.int64), ("traveled_m", np.float64), ("scale", np.float64),
 ])  # fmt: skip
 _WHOLE = ("session", "count", "stamps_ns", "scan_index", "pairs")  # arrays of whole numbers
-_STEP_M = 0.001  # of coordinates on disk, more where the keyframe reaches farther than 33 m
-_MOST_STEP_M = 1e6  # of a map of points that are not damaged
-_WIDE_FROM_M = 0.01  # step from which on they take 32 bits: one far return must not make all points coarse
+_STEP_M = 0.001  # of coordinates on disk, larger where the keyframe reaches farther than 33 m
+_MOST_STEP_M = 1e6  # largest step in a map whose points are not damaged
+_WIDE_FROM_M = 0.01  # step above which they take 32 bits: one far return must not make all points coarse
 _BLOCK = 1 << 20
 
 
@@ -80,7 +80,7 @@ class Edges:
     weight: NDArray[np.float64]
 
     def among(self, chosen: NDArray[np.int64]) -> Edges:
-        """Those between chosen keyframes, renumbered in this order."""
+        """The edges between chosen keyframes, which are renumbered in this order."""
         number = np.full(max(int(self.pairs.max(initial=-1)), int(chosen.max(initial=-1))) + 1, -1)
         number[chosen] = np.arange(len(chosen))
         pairs = number[self.pairs]
@@ -88,11 +88,11 @@ class Edges:
 
     @classmethod
     def chained(cls, *parts: Edges) -> Edges:
-        """Those of several, one after the other."""
+        """The edges of several parts, concatenated."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _EDGE_ARRAYS))
 
     def where(self, kept: NDArray[np.bool_]) -> Edges:
-        """Those for which ``kept`` (E,) holds."""
+        """The edges for which ``kept`` (E,) is true."""
         return Edges(*(getattr(self, name)[kept] for name in _EDGE_ARRAYS))
 
 
@@ -101,7 +101,7 @@ _EDGE_ARRAYS = Edges.__match_args__
 
 @dataclass(frozen=True, slots=True)
 class SavedPoints:
-    """The points of one keyframe: ``rows`` (M, d) times ``step_m``; of a map that was opened, on disk."""
+    """The points of one keyframe: ``rows`` (M, d) times ``step_m``; memory-mapped in a map that was opened."""
 
     rows: NDArray[np.number]
     step_m: float
@@ -113,13 +113,13 @@ class SavedPoints:
 
 @dataclass(frozen=True, slots=True)
 class SavedMap:
-    """A map, as it is written to disk and opened from there.
+    """A map as it is stored on disk.
 
-    folder : where it lies
+    folder : its directory
     dimension : 2 or 3
     keyframes : their ``T_odom_lidar`` is the final pose, T_map_lidar
     session : (K,) number of the session that each keyframe comes from
-    sessions : in the order they joined
+    sessions : in chronological order
     edges : in force between the keyframes
     """
 
@@ -143,7 +143,7 @@ class SavedMap:
 
 
 def write_saved_map(saved: SavedMap) -> None:
-    """Write a map into its folder, which is new; map.json comes last."""
+    """Write a map into its folder, which must not exist; map.json is written last."""
     folder, keyframes = saved.folder, saved.keyframes
     folder.mkdir(parents=True)
     rows = np.empty(len(keyframes), _ROW)
@@ -167,7 +167,7 @@ def write_saved_map(saved: SavedMap) -> None:
 
 
 def open_saved_map(path: Path) -> SavedMap:
-    """The map of a run directory, or in a folder itself. Raises InputError where there is none that is whole."""
+    """The map of a run directory, or of a map folder. Raises InputError if there is none or it is damaged."""
     folder = path / MAP_FOLDER if (path / MAP_FOLDER).is_dir() else path
     if not (folder / _INDEX).is_file():
         raise InputError(f"{path}: holds no map ({MAP_FOLDER}/{_INDEX}); give the directory of a finished run")
@@ -197,7 +197,7 @@ def open_saved_map(path: Path) -> SavedMap:
             )
         keyframes = _keyframes(rows, folder / _POINTS, d)
         return SavedMap(folder, d, keyframes, rows["session"], index.sessions, Edges(**edges))
-    except (LookupError, ValueError, TypeError) as error:  # written by something else, checksums included
+    except (LookupError, ValueError, TypeError) as error:  # written by another program, checksums included
         raise _damaged(folder, f"is not as scanchain writes it ({one_line(error)})") from error
 
 
@@ -253,7 +253,7 @@ def _index(path: Path) -> _Index:
 
 
 def _crc32(path: Path) -> int:
-    """CRC-32 of a file, which sees any few flipped bits."""
+    """CRC-32 of a file, which detects any few flipped bits."""
     crc = 0
     with path.open("rb") as file:
         while block := file.read(_BLOCK):

@@ -1,4 +1,4 @@
-"""Distortion of scans by the lidar's own motion: how large it is, and which times of their points explain them."""
+"""Distortion of scans by the lidar's own motion: its size, and whether point times explain it."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from scanchain.logs.messages.point_times import from_azimuth
 from scanchain.odometry.odometry import Odometry
 from scanchain.settings import load_settings
 
-_AT = (0.5, 0.25, 0.75, 0.0, 1.0, 0.375, 0.625)  # where windows lie in the log, in the order of their trial
-_ENOUGH, _MOST, _SCANS = 3, 5, 16  # windows in which the lidar moves: enough where they are clear; scans of each
-_BEGIN, _BLOCK = 4, 3  # first scans of a window, whose map is small, and scans whose residuals count as one value
-_POINTS, _MATCHED = 8_000, 500  # points of a scan, at random, and those that are matched
-_LEAST_M = 0.03  # distortion of a scan below which it is lost in the noise of the ranges
-_CLEAR = 3.5  # standard errors of a mean difference that is clear: of 12 values by chance in 1 of 400
-_LEAST_GAIN = 0.01  # share of the residuals by which times that are adopted lower them
-_MOST_LOSS = 5.0  # loss by opposite times over the gain: 3 where these remove all distortion, 5 at three quarters
-_SPINS_AT_S = (0.02, 0.25)  # periods that are those of a revolution
-_SURE = 0.9  # least agreement of the azimuths at which scans begin
-_AROUND = 0.8  # least share of the directions that a lidar sees which looks around
+_AT = (0.5, 0.25, 0.75, 0.0, 1.0, 0.375, 0.625)  # positions of windows in the log, in the order tried
+_ENOUGH, _MOST, _SCANS = 3, 5, 16  # windows with motion: enough if significant, at most; scans each
+_BEGIN, _BLOCK = 4, 3  # first scans of a window, skipped while its map is small; scans per residual block
+_POINTS, _MATCHED = 8_000, 500  # points per scan, sampled at random, and points per scan to match
+_LEAST_M = 0.03  # distortion of a scan below which range noise hides it
+_CLEAR = 3.5  # standard errors above which a mean is significant: for 12 values by chance in 1 of 400
+_LEAST_GAIN = 0.01  # least relative decrease of the residuals for times to be adopted
+_MOST_LOSS = 5.0  # largest ratio of loss (opposite times) to gain: 3 if full times fit best, 5 if 3/4 of them do
+_SPINS_AT_S = (0.02, 0.25)  # scan periods that are plausible for one revolution
+_SURE = 0.9  # least mean resultant length of the azimuths at which scans begin
+_AROUND = 0.8  # least share of directions with points for a lidar with a 360° view
 
 
 @dataclass(frozen=True, slots=True)
 class Distortion:
-    """Distortion of the scans of a log, and whether times of their points explain it.
+    """Distortion of the scans of a log, and whether point times explain it.
 
-    size_m : in the most distorted window, where it is not removed; ``motion`` causes it, in words
-    config : with the times that are tried: the log's own if ``is_given``, else by azimuth in the better sense
-    gain, loss : relative changes of residuals from no times: decrease by these, increase by the opposite ones
+    size_m : per scan in the most distorted window, uncorrected; ``motion`` describes its cause in words
+    config : with the tested times: the log's own if ``is_given``, else by azimuth in the better rotation sense
+    gain, loss : relative decrease of the residuals by these times and increase by the opposite ones, against none
     sigmas : gain over its standard error
-    is_spinning : whether the scans look around and begin at one azimuth, as those of a spinning lidar
+    is_spinning : whether the scans cover 360° and begin at one azimuth, as those of a spinning lidar
     """
 
     size_m: float
@@ -55,9 +55,9 @@ class Distortion:
 
     @property
     def share(self) -> float:
-        """Of the distortion by these times, what residuals show: where the parabola through the three is least.
+        """Share of these times that fits best: the minimum of the parabola through the three residuals.
 
-        1 where it has no least value, or is of times by azimuth for a lidar that does not spin.
+        1 where there is no minimum, or where times are by azimuth and the lidar does not spin.
         """
         if self.loss <= self.gain or not (self.is_given or self.is_spinning):
             return 1.0
@@ -65,33 +65,33 @@ class Distortion:
 
     @property
     def is_shown(self) -> bool:
-        """True if these times explain the scans clearly better than none, and as no others would."""
+        """True if these times fit significantly better than none, with a loss by opposite times to match."""
         is_clear = self.gain > _LEAST_GAIN and self.sigmas > _CLEAR
         return is_clear and 0.0 < self.loss < _MOST_LOSS * self.gain
 
     @property
     def is_refuted(self) -> bool:
-        """True if no times explain the scans clearly better."""
+        """True if the scans fit significantly better without these times."""
         return self.sigmas < -_CLEAR
 
     def is_removed(self, log: Log) -> bool:
-        """True if a run removes it by these times."""
+        """True if a run corrects the distortion by these times."""
         wanted = log.config.point_times
         is_chosen = wanted == "azimuth" or (wanted == "auto" and log.dimension == 3 and self.is_shown)
         return self.is_given or (is_chosen and self.size_m > _LEAST_M)
 
     def advice(self, log: Log) -> tuple[str, str]:
-        """Distortion and its correction by a run, in words, and the flag that improves it, empty for none."""
+        """The distortion and whether a run corrects it, in words, and the flag that would improve it or ""."""
         size = f"distorted by up to {self.size_m:.2g} m per scan ({self.motion})"
         lack = "point times are not used" if log.config.point_times == "none" else "no point times"
         if self.size_m <= _LEAST_M:
-            return f"scans are {size}, less than ranges scatter", ""
+            return f"scans are {size}, less than the range noise", ""
         if self.is_removed(log) and self.is_given and self.is_refuted:
             return "scans fit better without their point times", "--log.point_times none"
         if self.is_removed(log):
             return f"scans are {size}, which point times remove", ""
         if self.is_refuted:
-            may_be = f"scans may be {size}, but not by a lidar that spins so"
+            may_be = f"scans may be {size}, but times by azimuth do not explain it"
             return f"{lack}: {'scans show no distortion' if self.is_spinning else may_be}", ""
         choice = "auto" if self.is_shown and log.dimension == 3 else "azimuth"
         return f"{lack}: scans {'are' if self.is_shown else 'may be'} {size}", f"--log.point_times {choice}"
@@ -102,18 +102,18 @@ class Distortion:
         changes = (-self.gain, self.loss)
         gain, loss = (f"{abs(100 * each):.2g} % {'smaller' if each < 0 else 'larger'}" for each in changes)
         start_rad, turn_s = self.config.revolution_start_rad, self.config.revolution_s
-        turn = f"times by azimuth, {self.config.point_times} from {start_rad:.3g} rad, {turn_s:.3g} s a turn"
+        turn = f"times by azimuth, {self.config.point_times} from {start_rad:.3g} rad, {turn_s:.3g} s per turn"
         times = "their own times" if self.is_given else turn
         return f"with {times}, residuals are {gain} than without, and {loss} with the opposite times"
 
 
 def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
-    """Distortion of a log's scans, by windows of it; None where too few scans follow one another.
+    """Distortion of a log's scans, measured in windows; None where too few scans follow one another.
 
-    Odometry is run over the same scans with times, with none and with the opposite ones. Residuals are least with
-    the right ones: with others the map shows a surface at another place from each position and heading.
+    Odometry is run over the same scans with times, without and with the opposite ones. Residuals are smallest with
+    the correct ones: with others, the map shows a surface at different positions from each pose.
 
-    of_given : whether times that the log has are measured too; else None for such a log
+    of_given : whether to test times that the log has, too; else None for such a log
     """
     config, rng, mounting = load_settings(log.dimension).config, np.random.default_rng(0), log.stated_mounting
     preprocess = msgspec.structs.replace(config.preprocess, match_points=_MATCHED, calibrate_elevation=False)
@@ -126,7 +126,7 @@ def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
         if found is None and not is_given:
             timing, is_spinning = _by_azimuth(window, log.config)
         scans = [_prepared(scan, timing, rng) for scan in window]
-        with suppress(InputError):  # no point in the range that is used
+        with suppress(InputError):  # no point within the configured range
             without, size = _residuals(scans, 0.0, config, mounting)
             if size[0] > _LEAST_M:
                 with_times = (_residuals(scans, sense, config, mounting)[0] for sense in (1.0, -1.0))
@@ -146,7 +146,7 @@ def _compared(
     is_given: bool,
     is_spinning: bool,
 ) -> Distortion:
-    """The distortion by logarithms of residuals (3, N) of windows: with no times, with times and opposite ones."""
+    """Distortion from log residuals (3, N) of each window: without times, with them, with the opposite ones."""
     without, ahead, back = np.concatenate(residuals, axis=1) if residuals else np.zeros((3, 2))
     if is_given or ahead.mean() <= back.mean():
         sense, better, worse = "clockwise", ahead, back
@@ -158,11 +158,11 @@ def _compared(
 
 
 def choose_point_times(log: Log, *, deskew: bool = True) -> None:
-    """Time points by azimuth, where the log's clouds have no times and show clearly that they are distorted so.
+    """Set point times by azimuth where clouds have none and such times fit significantly better.
 
-    ``log.point_times`` ``azimuth`` does so in any case, in the better sense, ``none`` never. Notes of the log say
-    what was found, ``log.distortion`` and ``log.distorted_share`` what remains. Planar scans without times may be
-    distorted in any case, and scans with times where a run does not ``deskew`` them.
+    ``log.point_times`` ``azimuth`` sets them in any case, in the better rotation sense, ``none`` never. Notes of
+    the log state the result, ``log.distortion`` and ``log.distorted_share`` the uncorrected rest. Planar scans
+    without times may be distorted in any case, and scans with times where a run does not ``deskew`` them.
     """
     wanted = log.config.point_times
     is_open = wanted == "azimuth" or (wanted in ("auto", "none") and log.dimension == 3)
@@ -187,7 +187,7 @@ def _adopt_point_times(log: Log, wanted: str) -> None:
 
 
 def _sweep_share(log: Log, *, deskew: bool = True) -> float:
-    """Duration of scans over the time from one to the next; 0 where their times deskew them."""
+    """Scan duration over scan period; 0 where point times deskew the scans."""
     for window in log.windows(_AT[:1], _SCANS):
         if not (deskew and len(window[0].times_s)):
             period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window])))
@@ -196,9 +196,9 @@ def _sweep_share(log: Log, *, deskew: bool = True) -> float:
 
 
 def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, bool]:
-    """Clockwise times, a turn from scan to scan from where the data begin, and whether scans look like such turns.
+    """Clockwise timing, one turn per scan from its first point's azimuth, and whether scans look like such turns.
 
-    The beginning is as configured where scans do not agree in it, the turn where it would be none of a lidar.
+    The first azimuth is as configured where scans disagree on it, the period where it is implausible for a lidar.
     """
     period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window]))) / config.every
     begins = np.exp(1j * np.array([np.arctan2(*scan.points[0, 1::-1]) for scan in window])).mean()
@@ -213,7 +213,7 @@ def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, b
 
 
 def _prepared(scan: Scan, timing: LogConfig, rng: np.random.Generator) -> Scan:
-    """Some points of a scan, timed by themselves or by azimuth, from the middle of the scan on."""
+    """Random points of a scan, with their own times or by azimuth, relative to the middle of the scan."""
     chosen = np.flatnonzero(rng.random(len(scan.points)) * len(scan.points) < _POINTS)
     points = scan.points[chosen]
     times_s = scan.times_s[chosen] if len(scan.times_s) else from_azimuth(points, timing)
@@ -224,7 +224,7 @@ def _prepared(scan: Scan, timing: LogConfig, rng: np.random.Generator) -> Scan:
 def _residuals(
     scans: Sequence[Scan], sense: float, config: Config, T_base_lidar: Pose | None
 ) -> tuple[NDArray[np.float64], tuple[float, str]]:
-    """Mean squared residuals of blocks of scans, their times multiplied; the distortion and the motion by it."""
+    """RMS residuals of blocks of scans, times multiplied by ``sense``; largest distortion and its cause."""
     odometry = Odometry(config, T_base_lidar, dimension=scans[0].points.shape[1])
     tracked = [odometry.place(replace(scan, times_s=np.float32(sense) * scan.times_s)) for scan in scans]
     rms_m = np.array([each.match.residual_m for each in tracked[_BEGIN:]])
@@ -239,7 +239,7 @@ def _residuals(
 
 
 def _sigmas(gains: NDArray[np.float64]) -> float:
-    """Mean gain over its standard error; each counts up to the median size, since gains grow with the motion."""
+    """Mean gain over its standard error; gains, which grow with the motion, are clipped to their median size."""
     limit = float(np.median(np.abs(gains)))
     clipped = np.clip(gains, -limit, limit)
     return float(clipped.mean() / max(np.std(clipped, ddof=1) / np.sqrt(len(gains)), 1e-9))

@@ -16,22 +16,22 @@ from scanchain.kernels.scans import raise_elevation
 from scanchain.preprocess import Sweep
 from scanchain.registration.search import evenly
 
-_FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, and distance of two in cells: soon, then well
+_FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, their spacing in cells: first window, later ones
 _CELL_M = 1.0  # edge of a cell
-_RANGE_CELLS = 14.0  # least number of cells that the median range spans: they are small in narrow surroundings
-_SMALLEST = 0.125  # smallest factor by which they shrink
+_RANGE_CELLS = 14.0  # least number of cells that the median range spans: cells shrink in narrow surroundings
+_SMALLEST = 0.125  # smallest factor on the edge of a cell
 _POINTS = 3500  # largest number of points of each scan, evenly spread
-_STEPS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps, offset and turns of the last of them
+_STEPS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps; offset and turns of a converged one
 _KERNEL = 1.5 / 0.6745  # scale of the robust weight over the median residual
-_RIDGE = 1e-6  # keeps directions that no plane sees from a division by zero
-_SCATTER_RAD = math.radians(0.02)  # standard deviation assumed of a window, beyond its own, before others are seen
-_SHARED_RAD = math.radians(0.01)  # the part of it that is in every window's weight
+_RIDGE = 1e-6  # regularizes directions that no plane constrains
+_SCATTER_RAD = math.radians(0.02)  # prior standard deviation of a window's offset in addition to its own σ
+_SHARED_RAD = math.radians(0.01)  # the part of it that is added to every window's σ for its weight
 _LEAST_RAD, _SIGMAS = math.radians(0.03), 4.0  # smallest offset that is corrected, and its least significance
-_LARGEST_RAD = math.radians(1.0)  # largest one that is believed
+_LARGEST_RAD = math.radians(1.0)  # largest offset that is accepted
 
 
 class Adjustment(NamedTuple):
-    """Scans adjusted together: their poses (K, 4, 4), the last one as it was, and the offset with its σ."""
+    """Scans adjusted together: their poses (K, 4, 4), the last one unchanged, and the offset with its σ."""
 
     poses: Matrix
     offset_rad: float
@@ -39,13 +39,13 @@ class Adjustment(NamedTuple):
 
 
 class ElevationCalibration:
-    """The elevation offset of a lidar, estimated again and again as it moves, ever more seldom.
+    """The elevation offset of a lidar, re-estimated as it moves, at growing intervals.
 
     Ground seen from afar lies too high or too low by the offset times the distance, and a map of such points
     pitches every scan that is aligned to it: an offset of 0.2°, as in KITTI, by 0.01° per meter.
 
-    offset_rad : what points are corrected by: the mean of the windows where it is significant, else 0
-    sigma_rad : standard deviation of that mean, by the scatter of the windows; infinite before the first one
+    offset_rad : correction of the points: the mean of the windows where it is significant, else 0
+    sigma_rad : standard deviation of that mean, from the scatter of the windows; infinite before the first one
     """
 
     def __init__(self, *, is_wanted: bool) -> None:
@@ -61,18 +61,18 @@ class ElevationCalibration:
         return replace(sweep, points=raised(sweep.points, self.offset_rad)) if self.offset_rad else sweep
 
     def forget(self) -> None:
-        """Forget the scans that were collected: the next pose does not follow from theirs."""
+        """Discard the collected scans: the next pose is not connected to theirs."""
         self.T_odom_last: Pose | None = None
         self.left_out = 0
         self.collected: list[tuple[Points, Pose]] = []
-        self.adjusting: Adjusting | None = None  # the scans collected, a step at a scan
-        self.since: list[tuple[Points, Pose]] = []  # the scans since then
+        self.adjusting: Adjusting | None = None  # of the collected scans, one step per scan
+        self.since: list[tuple[Points, Pose]] = []  # the scans since they were collected
 
     def take(self, points: Points, T_odom_lidar: Pose) -> list[tuple[Points, Pose]]:
-        """Collect a scan; empty unless a window is adjusted and changes the offset by as much as matters.
+        """Add a scan; returns corrected scans where a window changed the offset significantly, else none.
 
-        Then its scans, with adjusted poses, of which the last one stays as it was, and those since are returned,
-        corrected. After n windows n scans are left out.
+        These are the window's scans with their adjusted poses, the last one unchanged, and the scans since.
+        After n windows, n scans are skipped.
 
         points : (N, 3) of the map, deskewed and corrected
         """
@@ -119,10 +119,10 @@ class ElevationCalibration:
 
 
 def _combined(estimates: Matrix) -> tuple[float, float]:
-    """Mean of windows (n, 2), each an offset and its σ, and its standard deviation.
+    """Weighted mean of the windows (n, 2), each an offset and its σ, and its standard deviation.
 
-    Beyond their own σ windows scatter, as the scans of one share distortions: by as much as they are seen to, and
-    by what is assumed of one of them.
+    Windows scatter by more than their own σ, since the scans of one share distortions. The standard deviation
+    includes the observed scatter, with the prior _SCATTER_RAD counted as that of one more window.
     """
     offset_rad, variance = estimates[:, 0], estimates[:, 1] ** 2
     weight = 1.0 / (variance + _SHARED_RAD**2)
@@ -138,11 +138,11 @@ def raised(points: Points, offset_rad: float) -> Points:
 
 
 class Adjusting:
-    """Adjustment of poses and elevation offset such that the planes that several scans (N, 3) see are thinnest.
+    """Plane adjustment of poses and elevation offset: makes planes in several scans (N, 3) as thin as possible.
 
     Gauss-Newton over all poses and the offset δ: with p(δ) the raised point of scan k, the
-    residuals are the distances of T_k p(δ) from the planes, free too, of cells of a grid whose points, of at least
-    three scans, are flat (plane adjustment; Liu and Zhang 2021). The ground may have any shape.
+    residuals are the distances of T_k p(δ) from planes, estimated too, of the grid cells whose points, from at
+    least three scans, are flat (Liu and Zhang 2021). The ground may have any shape.
     """
 
     def __init__(self, scans: Sequence[Points], poses: Matrix, cell_m: float) -> None:
@@ -151,15 +151,15 @@ class Adjusting:
         self.offset_rad, self.steps = 0.0, 0
 
     def step(self) -> Adjustment | None:
-        """One step; what is found after the last one, with an infinite σ where there are no planes."""
+        """Run one step; the result after the last one, else None; its σ is infinite where there are no planes."""
         n, size = len(self.points), 6 * len(self.poses) + 1
-        beside, normals, residual, plane = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int32)
+        offset, normals, residual, plane = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int32)
         lifted = raised(self.points, self.offset_rad)
-        count = planes(lifted, self.number, self.poses, self.cell_m, beside, residual, plane, normals)
+        count = planes(lifted, self.number, self.poses, self.cell_m, offset, residual, plane, normals)
         if not count:
             return Adjustment(self.poses, 0.0, math.inf)
         scale_m = max(_KERNEL * float(np.median(np.abs(residual[plane >= 0]))), 1e-6)
-        H, of_planes = np.zeros((size + 1, size + 1)), (plane, beside, residual, normals[:count])
+        H, of_planes = np.zeros((size + 1, size + 1)), (plane, offset, residual, normals[:count])
         variance, gain = plane_equations(lifted, self.number, *of_planes, self.poses, scale_m, H)
         H, b = H[:-1, :-1], H[:-1, -1]
         inverse = np.linalg.inv(H + _RIDGE * np.trace(H) / size * np.eye(size))

@@ -18,12 +18,12 @@ _LATEST = 0.1  # weight of the last scan in the mean of the systematic errors
 class Located(msgspec.Struct, frozen=True):
     """A scan as odometry placed it, with the state of odometry that the back end needs.
 
-    ``scale`` is that of its voxels, dense scans or not, ``local_map`` (L, d) its map, odom frame, empty unless
-    ``is_keyframe``;
+    ``scale`` is that of its voxels, without the factor for dense scans;
+    ``local_map`` (L, d) is its map, odom frame, empty unless ``is_keyframe``;
     ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame, zero unless
     ``is_keyframe``;
-    ``errors`` are those of its pose against the map, of the first scan unless ``is_keyframe``;
-    ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again;
+    ``errors`` are those of the pose of the last keyframe, this scan included, against the map;
+    ``first_points`` (M, d) are those of the first scan, deskewed once the second one gives its velocity;
     ``noise_m`` is the standard deviation of the ranges where it is above the one configured, else 0.
     """
 
@@ -47,7 +47,7 @@ class FrontEnd:
         self.T_odom_last = lie.identity(self.odometry.dimension)
         self.nothing = np.zeros((lie.twist_size(self.T_odom_last),) * 2)
         self.covariance: Matrix | None = self.nothing  # of the motion since the keyframe, None where unknown
-        self.doubt = self.nothing  # of the motion, by scans that their correspondences contradict
+        self.inflation = self.nothing  # covariance that contradicted scans add to that of the motion
         self.error_tracker = KeyframeErrorTracker(len(self.nothing))
         self.errors = KeyframeErrors(1.0, self.nothing, 0.0)  # of the last keyframe
         self.has_wheels = False
@@ -70,7 +70,7 @@ class FrontEnd:
         if is_keyframe:
             self.errors = self.error_tracker.at_keyframe(tracked, self.T_odom_keyframe)
             self.T_odom_keyframe = tracked.T_odom_lidar
-            self.covariance, self.doubt, self.since_keyframe = self.nothing, self.nothing, 0
+            self.covariance, self.inflation, self.since_keyframe = self.nothing, self.nothing, 0
         return Located(
             tracked=tracked,
             is_keyframe=is_keyframe,
@@ -83,10 +83,10 @@ class FrontEnd:
         )
 
     def _since(self, tracked: Tracked) -> Matrix:
-        """Information (k, k) of the motion since the last keyframe: of the match, and of all predictions since.
+        """Information (k, k) of the motion since the last keyframe, from the match and all predictions since.
 
-        The wheels' errors go on from scan to scan, so that their standard deviations add up, not the variances; so
-        do those of scans between that have no reading. Without wheels the match is all there is.
+        Wheel errors are correlated from scan to scan, so that their standard deviations add up, not the variances,
+        for scans without a reading in between, too. Without wheels, only the match counts.
         """
         prior, of_match = tracked.prior, tracked.match.information
         self.since_keyframe += 1
@@ -99,9 +99,9 @@ class FrontEnd:
             return of_match
         n, Ad = self.since_keyframe, lie.adjoint(lie.between(tracked.T_odom_lidar, T_last))
         if not is_planar:
-            self.doubt = Ad @ self.doubt @ Ad.T + _doubt_of(tracked)
+            self.inflation = Ad @ self.inflation @ Ad.T + _inflation_of(tracked)
         if self.covariance is None:
-            return self._doubted(of_match)
+            return self._inflated(of_match)
         predicted = n * prior.covariance
         if n > 1:
             predicted = predicted + (n / (n - 1) * Ad).dot(self.covariance).dot(Ad.T)
@@ -109,22 +109,22 @@ class FrontEnd:
         if tracked.state is not State.LOST:
             information += of_match
         self.covariance = definite_inverse(information)
-        return self._doubted(information)
+        return self._inflated(information)
 
-    def _doubted(self, information: Matrix) -> Matrix:
-        """Information with the doubt added to the covariance."""
-        if not self.doubt.any():
+    def _inflated(self, information: Matrix) -> Matrix:
+        """Information after adding the covariance of contradicted scans."""
+        if not self.inflation.any():
             return information
-        scale = np.eye(len(information)) + information @ self.doubt
+        scale = np.eye(len(information)) + information @ self.inflation
         return np.asarray(np.linalg.solve(scale, information), np.float64)
 
 
-def _doubt_of(tracked: Tracked) -> Matrix:
+def _inflation_of(tracked: Tracked) -> Matrix:
     """Covariance (k, k) that a scan adds to the motion where its correspondences contradict the pose.
 
-    Such a pose is known no better than predicted, which it is off by the innovation. The map that the next scans
-    are aligned to holds this one, so that they inherit its error. In the plane, where most of the poses that so
-    few correspondences contradict are right, doubt would let drift gather: there is none.
+    Such a pose is no more certain than the prediction, from which it differs by the innovation. The next scans are
+    aligned to a map that contains this one and inherit its error. It is not used in the plane, where most
+    contradicted poses are right and an inflated covariance would let drift accumulate.
     """
     prior, match = tracked.prior, tracked.match
     if tracked.state is State.LOST or match.fit >= LEAST_FIT:
@@ -134,15 +134,15 @@ def _doubt_of(tracked: Tracked) -> Matrix:
 
 
 class KeyframeErrorTracker:
-    """Mean systematic error of the scans, and what the map was renewed by since the last keyframe."""
+    """Mean systematic error of the scans, and the share of the map renewed since the last keyframe."""
 
     def __init__(self, freedom: int) -> None:
         self.systematic = np.zeros((freedom, freedom))
-        self.scans = 0  # that the mean is of
-        self.is_open = False  # since the last keyframe: poses that no correspondences determined
+        self.scans = 0  # number of scans in the mean
+        self.is_open = False  # whether a pose since the last keyframe was undetermined or lost
 
     def take(self, tracked: Tracked) -> None:
-        """Take a scan. Of those whose pose is open or contradicted the sectors say nothing."""
+        """Add a scan. One whose pose is undetermined or contradicted is left out of the mean."""
         match = tracked.match
         if match.observability < 1.0 or tracked.state is State.LOST:
             self.is_open = True
@@ -153,10 +153,10 @@ class KeyframeErrorTracker:
             )
 
     def at_keyframe(self, tracked: Tracked, T_odom_keyframe: Pose) -> KeyframeErrors:
-        """Errors at a new keyframe after that of another pose.
+        """Errors at a new keyframe; the one before has the pose ``T_odom_keyframe``.
 
-        A map as wide as the scans is renewed by the distance over their root mean square range, and, where they do
-        not look around, by turning.
+        A map as wide as the scans is renewed by the distance over their root mean square range, and by turning,
+        since scans need not cover 360°.
         """
         distance_m, angle_rad = lie.apart(T_odom_keyframe, tracked.T_odom_lidar)
         points = tracked.matched

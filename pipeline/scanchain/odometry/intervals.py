@@ -1,4 +1,4 @@
-"""Seconds between successive scans, by stamps that need not be plausible, and stamps that are certainly wrong."""
+"""Seconds between successive scans whose stamps may be implausible; rejection of certainly wrong stamps."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Result = TypeVar("Result")
 
 _SHORTEST_S = 0.005  # below the period of any lidar: scans that follow each other faster came in a burst
 _GAP = 5.0  # times the usual interval: a longer one means that scans are missing
-_ALIKE = 1.4  # largest ratio of two intervals that agree
+_SIMILAR = 1.4  # largest ratio of two intervals that agree
 _LONGEST = 100.0  # times the usual interval: a longer one is no plausible interval of stamps
-_WRONG = 20.0  # ratio to the median of the last ones, from which on the usual interval never was usual
+_WRONG = 20.0  # ratio to the median of the last intervals, above which that replaces the usual interval
 _MEMORY = 0.9  # weight of the usual interval so far against the next one
-_RECENT = 15  # number of the last intervals that are remembered
-_FEWEST = 4  # of them, before a gap follows from intervals that are shorter than any lidar's
-_PART = 0.5  # of the time over which its points were measured, which the first interval is not shorter than
-_LOOKED_AT = 3  # intervals: of fewer, a burst or a gap may be the rule
-_REMEMBERED = 10  # the same where they are shorter than any lidar's, and number of the last ones that are kept
-_MOST_SWEEPS = 2.0  # intervals between scans that the times of a scan's points may span
-_SLOWEST_S = 15.0  # between scans, above which regular intervals are not of seconds but of a smaller unit
-_REGULAR = 1.1  # ratio of the intervals of a driver, above which people or gaps set them
+_RECENT = 15  # number of the last intervals that are retained
+_FEWEST = 4  # least number of them to detect a gap where the usual interval is shorter than any lidar's
+_PART = 0.5  # share of a scan's duration, below which the first interval is replaced by that duration
+_LOOKED_AT = 3  # intervals that are checked: fewer may all be in a burst or a gap
+_REMEMBERED = 10  # the same where they are shorter than any lidar's; also the number of intervals retained
+_MOST_SWEEPS = 2.0  # largest span of a scan's point times, in intervals between scans
+_SLOWEST_S = 15.0  # regular intervals above it are not in seconds but in a smaller unit
+_REGULAR = 1.1  # largest ratio of a driver's intervals; above it, scans come by hand or with gaps
 
 
 class Intervals:
@@ -42,10 +42,10 @@ class Intervals:
         self.recent_s: deque[float] = deque(maxlen=_RECENT)
 
     def take(self, scan: Scan, interval_s: float) -> None:
-        """Remember a scan, so long after the last one.
+        """Add a scan and the interval since the last one.
 
-        The usual interval is a running mean that leaves out gaps. Where it disagrees with the median of the last
-        ones, it came from a burst or from stamps that were wrong: the median takes its place.
+        The usual interval is a running mean that leaves out gaps. Where it is far from the median of the last
+        intervals, it came from a burst or from wrong stamps: the median replaces it.
         """
         if self.last_scan is not None:
             self.last_s = interval_s
@@ -64,9 +64,9 @@ class Intervals:
     def to(self, scan: Scan) -> float:
         """Seconds since the last scan, 0 for the first.
 
-        After a jump of the clock those of a gap. By the stamps where these agree with the usual interval or with
-        the times of the log, else as usual. Before an interval is usual, by the log where stamps do not go on, and
-        by the points where they took longer.
+        After a clock jump, its size, limited to that of a plausible gap. Otherwise by the stamps where these agree
+        with the usual interval or with the log times, else the usual interval. Before that is known: by the
+        stamps, by the log times where stamps do not increase, or the scan's duration where that is far longer.
         """
         if self.last_scan is None:
             return 0.0
@@ -77,19 +77,19 @@ class Intervals:
             interval_s = stamped_s if stamped_s > 0.0 else logged_s
             span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) else 0.0
             return span_s if interval_s < _PART * span_s else interval_s
-        if _are_alike(stamped_s, self.usual_s):
+        if _are_similar(stamped_s, self.usual_s):
             return stamped_s
-        is_plausible = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
+        is_plausible = _are_similar(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
         return stamped_s if is_plausible else self.usual_s
 
     def silence_s(self, scan: Scan) -> float:
-        """Seconds since the last scan, however many, or of a jump; 0 where the stamps and the log disagree."""
+        """Seconds since the last scan or of a clock jump, unlimited; 0 where stamps and log times disagree."""
         if self.last_scan is None:
             return 0.0
         if scan.clock_jump_s:
             return abs(scan.clock_jump_s)
         stamped_s, logged_s = _since(self.last_scan, scan)
-        return stamped_s if _are_alike(stamped_s, logged_s) else 0.0
+        return stamped_s if _are_similar(stamped_s, logged_s) else 0.0
 
     def is_gap(self, interval_s: float) -> bool:
         """True of an interval in which scans are missing."""
@@ -98,13 +98,13 @@ class Intervals:
 
 
 class LiveStamps:
-    """Remembers the last stamps, and refuses those that are certainly wrong."""
+    """Check of each stamp against the last ones; rejects those that are certainly wrong."""
 
     def __init__(self) -> None:
         self.stamps_ns: list[int] = []
 
     def passed(self, scan: Scan, process: Callable[[Scan], Result]) -> Result:
-        """The result of a scan, which is remembered after it.
+        """The result of processing a scan, whose stamp is then recorded.
 
         Raises InputError, and nothing changes, where its stamp or point times contradict those before.
         """
@@ -125,7 +125,7 @@ class LiveStamps:
         shortest_s, longest_s = min(recent_s[-_LOOKED_AT:]), max(recent_s[-_LOOKED_AT:])
         if shortest_s > _SLOWEST_S and longest_s < _REGULAR * shortest_s:
             raise InputError(
-                f"stamp_s grows by {longest_s:.6g} from scan to scan, which no lidar takes in seconds; wanted "
+                f"stamp_s grows by {longest_s:.6g} from scan to scan, too long for a lidar if in seconds; wanted "
                 f"seconds{SMALLER_UNITS}"
             )
         longest_s = max(recent_s)
@@ -143,6 +143,6 @@ def _since(last: Scan, scan: Scan) -> tuple[float, float]:
     return (scan.stamp_ns - last.stamp_ns) * 1e-9, (scan.log_time_ns - last.log_time_ns) * 1e-9
 
 
-def _are_alike(a: float, b: float) -> bool:
+def _are_similar(a: float, b: float) -> bool:
     """True if two intervals are positive and of about the same length."""
-    return 0.0 < b <= _ALIKE * a <= _ALIKE**2 * b
+    return 0.0 < b <= _SIMILAR * a <= _SIMILAR**2 * b

@@ -1,8 +1,8 @@
 """Errors of odometry by a delete-a-group jackknife over directions (Shao & Tu 1995, section 2.3).
 
-What scans and map have in common, beams that are off or scans that are distorted, leaves no residuals, so that the
-covariance of no match contains it. It shows where the points in one group of directions after the other are left
-out of scans *and* map: odometry then differs by the influence of that group.
+Errors that scans and map share, such as miscalibrated beams or distorted scans, leave no residuals, so that no
+match covariance contains them. They show when the points in each group of directions in turn are left out of
+scans *and* map: odometry then differs by the influence of that group.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from scanchain.odometry.odometry import Odometry
 from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
 from scanchain.threads import threads
 
-AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups; without a wide one a plane is open
-LONGEST = {2: 300, 3: 60}  # scans of a window; a log that is no longer is measured whole
-_LEAST_SQUARE = 1e-6  # m², sum over a window that stands still
-_TURN_M_RAD = 1.0  # path that counts for a turn, of which error grows as of motion
+AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups; without a wider one, a plane may be unconstrained
+LONGEST = {2: 300, 3: 60}  # scans per window; a log of at most that many is measured as a whole
+_LEAST_SQUARE = 1e-6  # m², least sum of squared path lengths over a window, for one at standstill
+_TURN_M_RAD = 1.0  # path length that counts for a turn, with which errors grow as with translation
 
 
 class Window(NamedTuple):
     """Odometry of successive scans, once with all points and once without each group of directions.
 
     first : number of the first scan
-    complete : (M, d+1, d+1) poses by all points; without : (G, M, d+1, d+1) without those of a group
+    complete : (M, d+1, d+1) poses with all points; without : (G, M, d+1, d+1) without those of each group
     """
 
     first: int
@@ -50,11 +50,11 @@ def influence(
 ) -> Influence:  # fmt: skip
     """Influence of each group of directions, for a log with known odometry.
 
-    A short log is measured whole, a long one in windows evenly spread along the path; between these the influence
-    per path is interpolated. Raises InputError where a window has no points.
+    A short log is measured as a whole, a long one in windows evenly spread along the path; between these the
+    influence per meter of path is interpolated. Raises InputError where a window has no points.
     scans : all of the log, in order; odometry : (M, d+1, d+1) their poses
-    keyframes, chosen : (K,) and (N,) numbers of scans whose motions are wanted
-    offset_rad : elevation offset of the lidar that was found on the log
+    keyframes, chosen : (K,) and (N,) scan numbers: motions between keyframes, and from them to the chosen scans
+    offset_rad : elevation offset of the lidar as estimated on the log
     """
     d = odometry.shape[-1] - 1
     kinds = np.repeat([0, 1], [AZIMUTHS[d], ELEVATIONS[d]])
@@ -78,8 +78,8 @@ def influence(
 def first_scans(path_m: NDArray[np.float64], dimension: int) -> list[int]:
     """Numbers of the first scans of the windows of a log with this path (N,).
 
-    So many windows that the matches of all groups are about as many as the log has scans, one at least; the middle
-    of each is where its share of the path is.
+    At least one, and at most as many as keep the matches of all groups below the number of scans of the log. Their
+    middles are evenly spread along the path.
     """
     scans, length = len(path_m), LONGEST[dimension]
     count = max(scans // (length * (AZIMUTHS[dimension] + ELEVATIONS[dimension] + 1)), 1)
@@ -89,7 +89,7 @@ def first_scans(path_m: NDArray[np.float64], dimension: int) -> list[int]:
 
 
 def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lidar: Pose | None) -> Window:
-    """Odometry of a window, the groups in parallel; one without which there is no first scan has no influence."""
+    """Odometry of a window, groups in parallel; a group without which odometry fails has no influence."""
     points = np.concatenate([each.sparse.points for each in window]) if window else np.empty((0, 3))
     if not len(points):
         raise InputError(f"the scans from {first} on have no points that could be left out")
@@ -147,7 +147,7 @@ def _raised(prepared: Prepared, offset_rad: float) -> Prepared:
 
 
 def _path_m(poses: Matrix) -> NDArray[np.float64]:
-    """(N,) path up to each pose, turns included."""
+    """Path length (N,) up to each pose, turns included."""
     twists = lie.log(lie.between(poses[:-1], poses[1:]))
     d = poses.shape[-1] - 1
     steps_m = np.hypot(np.linalg.norm(twists[:, :d], axis=1), _TURN_M_RAD * np.linalg.norm(twists[:, d:], axis=1))
@@ -157,9 +157,9 @@ def _path_m(poses: Matrix) -> NDArray[np.float64]:
 def _twists(
     measured: Sequence[Window], first: NDArray[np.int64], last: NDArray[np.int64], path_m: NDArray[np.float64]
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """(G, M, k) of motions between scans, and (M,) whether they are measured.
+    """Twists (G, M, k) by which motions between scans differ without each group, and (M,) whether measured.
 
-    Others have the rates of the windows, interpolated along the path.
+    Those not within a window are interpolated from the rates of the windows along the path.
     """
     middles_m = [path_m[each.first + len(each.complete) // 2] for each in measured]
     rates = np.array([_rates(each, path_m) for each in measured])
@@ -178,7 +178,7 @@ def _twists(
 
 
 def _rates(window: Window, path_m: NDArray[np.float64]) -> Matrix:
-    """(G, k) twist per path by which motions differ without each group: slopes of the sums over the window."""
+    """Twists (G, k) per meter of path by which motions differ without each group: slopes of their running sums."""
     scans = np.arange(len(window.complete))
     sums = np.cumsum(_changes(window, scans[:-1], scans[1:]), axis=1)
     along_m = path_m[window.first + scans[1:]]
@@ -187,6 +187,6 @@ def _rates(window: Window, path_m: NDArray[np.float64]) -> Matrix:
 
 
 def _changes(window: Window, first: NDArray[np.int64], last: NDArray[np.int64]) -> Matrix:
-    """(G, M, k) by which motions between scans of a window differ without each group."""
+    """Twists (G, M, k) by which motions between scans of a window differ without each group."""
     complete = lie.between(window.complete[first], window.complete[last])
     return lie.log(lie.inverse(complete) @ (lie.inverse(window.without[:, first]) @ window.without[:, last]))

@@ -25,19 +25,19 @@ from scanchain.registration import MapKeeper, VoxelMap, create_matcher
 from scanchain.registration.align import as_ambiguous, with_source_frame
 from scanchain.settings import check_dimension, check_order, load_settings
 
-COPY = "the scan before once more, to the last bit: it has that pose, and says nothing of a motion since"
+COPY = "bitwise copy of the previous scan: same pose, no information on the motion since"
 NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
-_SAMPLE = 1000  # number of points of two scans, evenly spread, which are compared
-_FEWEST_COPIED = 10  # least number of points of a scan that may be a copy
+_SAMPLE = 1000  # number of points, evenly spread, that are compared between two scans
+_FEWEST_COPIED = 10  # least number of points for a scan to count as a copy
 
 
 class Tracked(msgspec.Struct, frozen=True):
     """A scan with its pose in the odometry frame.
 
-    ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
-    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds are its times by stage.
+    ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed to the
+    scan's stamp, at which ``T_odom_lidar`` holds, in the lidar frame; the seconds are the run times by stage.
     ``prior`` is that of this pose, its covariance that at the middle of the scan;
-    ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule;
+    ``elsewhere_m`` is how far away it may be where its motion is unknown, else 0;
     ``is_repeated`` if its points are those of the scan before.
     """
 
@@ -58,10 +58,10 @@ class Tracked(msgspec.Struct, frozen=True):
 
 
 class _Registered(msgspec.Struct, frozen=True):
-    """The match of a scan, the points (N, d) that were aligned, deskewed to the middle, and the prediction.
+    """The match of a scan, the points (N, d) that were aligned, deskewed to its middle, and the prediction.
 
     ``elsewhere_m`` as in ``Tracked``, ``rival`` the twist (k,) to another pose that fits nearly as well;
-    ``is_standing`` if the lidar did not move since the scan before.
+    ``is_standing`` if the lidar has not moved since the scan before.
     """
 
     points: Points
@@ -74,7 +74,7 @@ class _Registered(msgspec.Struct, frozen=True):
 
 
 class Odometry:
-    """Scan-to-map odometry: one scan after another in, the pose of each out."""
+    """Scan-to-map odometry: scans in, one after another, their poses out."""
 
     def __init__(
         self, config: Config | None = None, T_base_lidar: Pose | None = None, *, dimension: int | None = None
@@ -98,9 +98,9 @@ class Odometry:
         self.map = MapKeeper(self.dimension, config.local_map)
         is_wanted = self.dimension == 3 and config.preprocess.calibrate_elevation
         self.elevation = ElevationCalibration(is_wanted=is_wanted)
-        self.calibrated_from = 0  # the first scan whose points are corrected by it
+        self.calibrated_from = 0  # number of the first scan whose points are corrected; 0 for none
         self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
-        self.first_points = self.first_sweep.points  # deskewed to its stamp, once the second scan is there
+        self.first_points = self.first_sweep.points  # deskewed to its stamp once the second one is there
         self.live_stamps = LiveStamps()
         self.scans = 0
         self.last: Tracked | None = None
@@ -111,7 +111,7 @@ class Odometry:
 
     @property
     def noise_m(self) -> float:
-        """Standard deviation of the ranges where it is above the one configured, else 0."""
+        """Measured standard deviation of the ranges where it is above the one configured, else 0."""
         measured_m = self.resolution.noise.sigma_m
         return measured_m if measured_m > self.config.matching.sensor_noise_m else 0.0
 
@@ -128,13 +128,13 @@ class Odometry:
         *,
         T_odom_base: Pose | None = None,
     ) -> Tracked:
-        """Place a scan as a driver gives it.
+        """The pose of a scan as it comes from a driver.
 
         points : (N, d) meters, lidar frame; rows that are not finite are counted in ``scan.dropped``
-        stamp_s : seconds since any fixed instant; the pose holds then
+        stamp_s : seconds since any fixed instant; the pose is that at the stamp
         times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
-        T_odom_base : pose of the robot by its wheels at ``stamp_s``
-        Raises InputError, and forgets the scan, where its stamp is not after the last one, or where stamps or
+        T_odom_base : pose of the robot by wheel odometry at ``stamp_s``
+        Raises InputError, and ignores the scan, where its stamp is not after the last one, or where stamps or
         ``times_s`` cannot be seconds.
         """
         scan = Scan.of(points, stamp_s, times_s, index=self.scans, T_odom_base=T_odom_base)
@@ -143,14 +143,13 @@ class Odometry:
     def process(self, scan: Scan | Prepared) -> Tracked:
         """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension.
 
-        A scan that is the one before once more, to the last bit, has its pose and changes nothing; its ``reason``
-        says so.
+        A bitwise copy of the scan before gets the same pose and changes nothing; its ``reason`` says so.
         """
         tracked = self.place(scan)
         return msgspec.structs.replace(owned(tracked), points=tracked.points.copy())
 
     def place(self, scan: Scan | Prepared) -> Tracked:
-        """As ``process``, but nobody may write into the arrays: they are those of odometry."""
+        """As ``process``, but the arrays must not be written to: odometry uses them."""
         self._check_dimension(scan.scan if isinstance(scan, Prepared) else scan)
         prepared = scan if isinstance(scan, Prepared) else prepare(scan, self.resolution)
         scan, self.resolution = prepared.scan, prepared.after
@@ -198,9 +197,10 @@ class Odometry:
         return tracked
 
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:
-        """The predicted pose; without the wheels where they jump, and the scan fits where they do not lead.
+        """The predicted pose; without wheel odometry where it jumps and the scan fits better without it.
 
-        Wheels that move as no vehicle does jump in any case. Scans that are in doubt are no evidence of it.
+        A wheel motion that no vehicle can make is rejected in any case. The scan does not count where most of the
+        last ones were lost or contradicted.
         """
         prediction = self.predictor.predict(scan)
         if prediction.jump_m == 0.0 or not len(self.map.surfaces):
@@ -220,7 +220,7 @@ class Odometry:
         return free
 
     def _register(self, scan: Scan, sweep: Sweep, sparse: Sweep, prediction: Prediction) -> _Registered:
-        """The match of a scan: aligned as predicted, deskewed by the motion that was found, and aligned again."""
+        """The match of a scan: aligned from the prediction, deskewed with the motion found, aligned again."""
         is_first = not len(self.map.surfaces)
         if is_first:
             self._check_range(scan, sparse)
@@ -254,14 +254,14 @@ class Odometry:
         return _Registered(points, match, state, prediction, rival=None if state is State.LOST else rival)
 
     def _deskewed(self, sparse: Sweep, match: Match, prediction: Prediction) -> tuple[Points, Match, Prediction]:
-        """Deskew once more with the velocity by the match, and align once more.
+        """Deskew again with the velocity from the match, and align again.
 
-        The second scan gives the velocity of the first one too, which stands distorted in the map until then.
+        The second scan also gives the velocity of the first one, which is distorted in the map until then.
         """
         T_odom_middle, prior = match.T_target_source, prediction.prior
         velocity = prediction.velocity_by(lie.log(lie.between(prediction.T_odom_last, T_odom_middle)))
         if prediction.is_second:
-            T_moved = lie.exp(self.first_sweep.middle_s * velocity)  # of the first scan's middle; its stamp stays
+            T_moved = lie.exp(self.first_sweep.middle_s * velocity)  # the pose at its stamp stays the same
             self.first_points = lie.transform(T_moved, self.first_sweep.from_middle(velocity))
             self.map.replace([(self.first_points, lie.identity(self.dimension))])
             T_odom_middle = T_moved @ T_odom_middle
@@ -273,7 +273,7 @@ class Odometry:
         return points, blurred(match, error), prediction
 
     def _reset_map(self, points: Points, prediction: Prediction, why: str) -> _Registered:
-        """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
+        """Clear the map, which the scan does not fit; a new one begins at the pose of the last scan."""
         self.map.replace([])
         self.recovery.forget()
         self.elevation.forget()
@@ -290,16 +290,16 @@ class Odometry:
         return State.DEGENERATE if match.observability < 1.0 else State.OK
 
     def _extend(self, points: Points, registered: _Registered) -> None:
-        """Insert the scan where its pose is known, or after so many lost scans that the map must be extended."""
+        """Insert a scan whose pose is known, or, after many lost scans, one at its predicted pose."""
         if self.recovery.gives_up(registered.state):
             self.map.insert(points, self.predictor.T_odom_lidar)
         if registered.state is State.LOST:
             return
-        if registered.is_standing or not self.standstill.is_standing:  # else drawn aside by what moves past
+        if registered.is_standing or not self.standstill.is_standing:  # else biased by objects that move past
             self.map.extend(points, self.predictor.T_odom_lidar, is_standing=registered.is_standing)
 
     def _calibrate(self, points: Points, state: State) -> None:
-        """Take the scan for the elevation offset; where one is found, rebuild the map without it."""
+        """Add the scan to the elevation calibration; rebuild the map where the offset changes."""
         if state is State.LOST:
             self.elevation.forget()
         if state is State.LOST or not self.predictor.velocity.any():  # the first scan cannot be deskewed
@@ -310,10 +310,11 @@ class Odometry:
             self.map.replace(corrected)
 
     def _at_stamp(self, tracked: Tracked, sweep: Sweep, prediction: Prediction) -> Tracked:
-        """A scan that was aligned as seen from its middle, as seen from its stamp.
+        """A scan aligned in the frame of its middle, moved to the frame of its stamp.
 
-        The stamp lies between two middles, or just beyond: by the mean velocity between them, which in rotation
-        changes at the rate of the last two motions, with an error as large; in translation that would be noise.
+        The stamp lies between two middles, or just beyond: the scan moves by the mean velocity between them. In
+        rotation this changes at the rate of the last two motions, with an error as large as the change; in
+        translation the change would be noise.
         """
         if sweep.middle_s == 0.0 or prediction.lasted_s <= 0.0:
             return tracked
@@ -342,7 +343,7 @@ class Odometry:
             )
 
     def _check_range(self, scan: Scan, sparse: Sweep) -> None:
-        """Refuse a first scan without a point at a distance that is used."""
+        """Raise InputError for a first scan without a point between the minimum and maximum range."""
         if len(sparse.points):
             return
         if not len(scan.points):
@@ -357,7 +358,8 @@ class Odometry:
 def _reported(registered: _Registered) -> State:
     """State of a scan as it is reported.
 
-    Of a new map, lost; of a pose that its correspondences contradict, so; of one of several that fit, degenerate.
+    LOST for the first scan of a new map, CONTRADICTED for a pose that its correspondences contradict, DEGENERATE
+    for one of several poses that fit.
     """
     if registered.elsewhere_m > 0.0:
         return State.LOST
@@ -369,9 +371,9 @@ def _reported(registered: _Registered) -> State:
 
 
 def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: int | None) -> tuple[Config, Pose]:
-    """Configuration and mounting, the ones that are left out filled in.
+    """Configuration and mounting, with defaults for those left out.
 
-    Raises InputError where they are none, or contradict each other or themselves.
+    Raises InputError where they are invalid or contradict each other.
     """
     if T_base_lidar is not None:
         d = 2 if checks.shape(T_base_lidar, "T_base_lidar") == (3, 3) else 3
@@ -389,7 +391,7 @@ def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: i
 
 
 def owned(tracked: Tracked) -> Tracked:
-    """The same with arrays of its own, except for ``points``: whoever writes into them moves no later pose."""
+    """The same with copied arrays, except for ``points``: writing into them changes no later pose."""
     match, prior = tracked.match, tracked.prior
     return msgspec.structs.replace(
         tracked,
@@ -422,7 +424,7 @@ def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> M
 
 
 def nothing_to_match(prediction: Prediction, config: Config) -> Match:
-    """Match of a scan without a point left: the prediction."""
+    """Match of a scan without points after preprocessing: the prediction."""
     limits = config.preprocess
     return replace(
         first_match(prediction.T_odom_lidar, np.empty((0, 0)), config.matching),

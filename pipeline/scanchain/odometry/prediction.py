@@ -19,34 +19,34 @@ from scanchain.odometry.intervals import Intervals
 from scanchain.registration.hand_eye import MountingEstimator
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
-_LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close
+_LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps are too close
 _LARGEST_WINDOW_M = 5.0  # largest half width of the search window
-_ACCELERATION_M_S2 = 4.0  # of a car, which limits the distance in space from the predicted pose
+_ACCELERATION_M_S2 = 4.0  # of a car; limits the search window around the predicted pose in space
 _FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
-_BURST = 0.05  # of the usual interval: scans that follow each other faster came in a burst and have no velocity
-_JUMP = 1.0  # m and rad, difference of two motions over a scan, from which on the wheels may have jumped
+_BURST = 0.05  # of the usual interval: a shorter one is due to a burst and gives no velocity
+_JUMP = 1.0  # m and rad, difference of two motions per scan, above which the wheels may have jumped
 _MEMORY = 0.9  # weight of the mean of the squared errors so far against the next one
 _SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
 _KNOWN = 5  # number of errors needed before the mean is used
-_CAUTION = 2.0  # factor from the root mean square to the standard deviation that is given
-_MOST_DOUBTFUL = 0.5  # share of the last scans in doubt, above which scans do not contradict the wheels
-_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation that is given
+_CAUTION = 2.0  # factor from the root mean square to the standard deviation of the prior
+_MOST_DOUBTFUL = 0.5  # share of lost or contradicted scans, above which scans cannot refute the wheels
+_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation of the prior
 
 
 class ErrorStatistics:
-    """Prediction error statistics: a running mean of squared errors, one for every component of a twist."""
+    """Prediction error statistics: a running mean of squared errors for each component of a twist."""
 
     def __init__(self, first_sigma: NDArray[np.float64]) -> None:
-        """first_sigma : (k,) standard deviations until errors are known, and the largest that are given."""
+        """first_sigma : (k,) standard deviations until enough errors are known, and their upper limit."""
         self.first_sigma = first_sigma
-        self.covariance = np.diag(first_sigma**2)  # (k, k) of the next prediction, rather too large than too small
+        self.covariance = np.diag(first_sigma**2)  # (k, k) of the next prediction, conservative
         self.least = (lie.by_component(len(first_sigma), _LEAST_M, _LEAST_RAD) ** 2).tolist()
         self.most = (first_sigma**2).tolist()
         self.squares = [0.0] * len(first_sigma)
         self.count = 0
 
     def update(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
-        """Take the error (k,) of a prediction against a match of this variance (k,), which is subtracted."""
+        """Add the error (k,) of a prediction against a match, whose variance (k,) is subtracted."""
         self.count += 1
         gain = max(1.0 - _MEMORY, 1.0 / self.count)
         for m, (e, of_match) in enumerate(zip(error.tolist(), variance.tolist(), strict=True)):
@@ -58,14 +58,14 @@ class ErrorStatistics:
 
 
 class MotionFilter:
-    """Constant velocity: the pose moves on by the motion, the motion stays but for its noise.
+    """Kalman filter at constant velocity: the pose advances by the motion, which changes by noise alone.
 
-    A match measures the pose. One that is a little off moves the pose, and the motion by as much as their errors
-    are known to go together: the next match, which is right again, does not reverse the motion.
+    A match measures the pose, and corrects the motion by their cross-covariance: after a slightly wrong match, the
+    next one, which is right again, does not reverse the motion.
 
     motion : T_previous_current, (d+1, d+1), over one scan
     pose_covariance, motion_covariance : (k, k) of twists in the lidar's own frame
-    covariance : (k, k) of both, pose by motion
+    covariance : (k, k) cross-covariance, pose by motion
     """
 
     def __init__(self, any_motion: Matrix) -> None:
@@ -81,17 +81,17 @@ class MotionFilter:
         self.pose_covariance = self.covariance = self.nothing
 
     def correct(self, innovation: NDArray[np.float64], information: Matrix, noise: Matrix) -> None:
-        """Take a pose that was measured (k,) away from the predicted one, with this information (k, k)."""
+        """Update by a measured pose: its innovation (k,) and information (k, k)."""
         pose, covariance, motion = self.predicted(noise)
         known = np.linalg.inv(np.linalg.inv(pose) + information)
-        gain = np.linalg.solve(pose, covariance).T  # how the motion follows the pose
+        gain = np.linalg.solve(pose, covariance).T  # of the motion, per correction of the pose
         self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ innovation))
         self.pose_covariance = known
         self.covariance = known @ gain.T
         self.motion_covariance = motion - gain @ (pose - known) @ gain.T
 
     def predicted(self, noise: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-        """Covariances (k, k) of the next pose, of pose and motion, and of the motion, whose change is noise."""
+        """Covariances (k, k) of the next pose, between pose and motion, and of the motion with its noise added."""
         motion = self.motion_covariance + noise
         A = lie.adjoint(lie.inverse(self.motion))
         covariance = A @ self.covariance
@@ -103,13 +103,13 @@ class Prediction(msgspec.Struct, frozen=True):
     """The predicted pose of a scan, and the motion before it, for other initial poses and for deskewing.
 
     prior : predicted pose and its covariance
-    is_guess : whether scans are missing before this one, so that the pose may be far off
+    is_guess : whether scans are missing before this one, so that the error may be large
     velocity : (k,) twist per second at the last scan, lidar frame
     T_odom_last, T_previous_current : pose of the last scan, (d+1, d+1), and its motion since the one before
-    interval_s, last_s, usual_s : since the last scan, before that one, and as a rule; 0 where unknown
-    silence_s : since the last scan by stamps that the log confirms, else 0
+    interval_s, last_s, usual_s : the interval since the last scan, the one before, the usual one; 0 where unknown
+    silence_s : since the last scan by stamps that log times confirm, else 0
     lost_s : for how long scans have been lost
-    jump_m : distance of a pose by the wheels from where the motion so far leads; 0 if it may have changed so
+    jump_m : distance between the motion by the wheels and the last motion continued; 0 where plausible
     config : largest speed and turn rate
     """
 
@@ -133,17 +133,17 @@ class Prediction(msgspec.Struct, frozen=True):
 
     @property
     def lasted_s(self) -> float:
-        """The interval, for a velocity: in a burst of stamps the usual one."""
+        """The interval to compute a velocity with: in a burst of stamps the usual one."""
         return self.usual_s if self.interval_s < _BURST * self.usual_s else self.interval_s
 
     @property
     def before_s(self) -> float:
-        """The same of the interval before."""
+        """The same for the interval before."""
         return self.usual_s if self.last_s < _BURST * self.usual_s else self.last_s
 
     @property
     def is_second(self) -> bool:
-        """True if no motion is known yet: one scan at most has been corrected."""
+        """True if no motion is known yet: at most one scan has been corrected."""
         return self.last_s == 0.0
 
     @property
@@ -154,19 +154,19 @@ class Prediction(msgspec.Struct, frozen=True):
 
     @property
     def farthest_m(self) -> float:
-        """Largest distance from the predicted pose that a vehicle gets to."""
+        """Largest plausible distance of a vehicle from the predicted pose."""
         elapsed_s = max(self.interval_s, self.usual_s, self.silence_s) + self.lost_s
         return 1.0 + elapsed_s * max(self.config.max_speed_m_s, _FASTEST_M_S)
 
     @property
     def is_out_of_reach(self) -> bool:
-        """True if the scan may be outside any search window, after so long a gap."""
+        """True if the gap is so long that the scan may be outside any search window."""
         return not self.prior.is_measured and self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
 
     def windows(self) -> tuple[tuple[float, float], ...]:
         """Half widths of the search windows around the predicted pose, the likeliest first, meters and radians.
 
-        In space by the acceleration that a vehicle may have and, where nothing is found there, by its speed.
+        In space the first follows from a vehicle's acceleration, the second, for where that fails, from its speed.
         """
         elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
         half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi)
@@ -182,18 +182,18 @@ class Prediction(msgspec.Struct, frozen=True):
     def alternatives(self) -> tuple[Pose, ...]:
         """Other initial poses.
 
-        The last motion again, the same over the time that passed by the stamps or half of that, half as much more,
-        and standing still.
+        The last motion again, the same velocity over 0.5, 1 and 1.5 times the interval by the stamps, and no
+        motion.
         """
         T = self.T_odom_last
         moving = (self.T_previous_current, self.interval_s, self.last_s, self.usual_s)
-        stretched = tuple(T @ _stretched(*moving, share=share) for share in (0.5, 1.0, 1.5))
-        return T @ self.T_previous_current, *stretched, T
+        scaled = tuple(T @ _motion_over(*moving, share=share) for share in (0.5, 1.0, 1.5))
+        return T @ self.T_previous_current, *scaled, T
 
     def velocity_by(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist (k,) per second at a scan after this motion (k,); the last one if stamps stand still.
+        """Twist (k,) per second at a scan after this motion (k,); the last one if stamps do not increase.
 
-        The mean since the last scan, carried on by half an interval with the acceleration between the last two.
+        The mean since the last scan, extrapolated by half an interval with the acceleration between the last two.
         """
         lasted_s, before_s = self.lasted_s, self.before_s
         if lasted_s <= 0.0:
@@ -206,8 +206,8 @@ class Prediction(msgspec.Struct, frozen=True):
     def deskewing_error(self, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
         """(k,) approximate error of a scan of this duration after deskewing at constant velocity.
 
-        Under an acceleration a the points lie ½ a t² off at the time t from the middle, on average a T²/24 over a
-        scan of T seconds; a by the last two motions.
+        At acceleration a, points are off by ½ a t² at the time t from the middle, on average a T²/24 over a
+        scan of T seconds; a is taken from the last two motions.
         """
         if self.lasted_s <= 0.0 or self.is_second:
             return np.zeros(len(self.velocity))
@@ -216,10 +216,10 @@ class Prediction(msgspec.Struct, frozen=True):
 
 
 class Predictor:
-    """The last pose, the last motion and the last wheel reading, with their uncertainties.
+    """Prediction from the last pose, motion and wheel reading, with their uncertainties.
 
-    Without wheels the motion goes on as it was, by a filter whose noise is that of the errors of its predictions.
-    Where a scan constrains nothing along a direction, the motion there goes on and its variance grows.
+    Without wheels, a constant-velocity filter predicts, whose noise is estimated from its prediction errors.
+    Along a direction that a scan does not constrain, the motion continues and its variance grows.
     """
 
     def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
@@ -235,10 +235,10 @@ class Predictor:
         self.filter = MotionFilter(np.diag(self.by_velocity.first_sigma**2))
         self.intervals = Intervals()
         self.lost_s = 0.0
-        self.T_odom_base: Pose | None = None  # by the wheels at the last scan, where nothing contradicts it
-        self.is_contradicted = False  # the reading at this scan
-        self.scans, self.doubtful = 0, 0.0  # that were corrected; share of the last ones in doubt, 1 after a jump
-        self.jumps: list[tuple[int, float]] = []  # scan and meters of each reading that was left out
+        self.T_odom_base: Pose | None = None  # by the wheels at the last scan; None where rejected
+        self.is_contradicted = False  # whether the wheel reading at this scan is rejected
+        self.scans, self.doubtful = 0, 0.0  # the latter: share of lost or contradicted scans, 1 after a jump
+        self.jumps: list[tuple[int, float]] = []  # scan number and meters of each rejected reading
 
     def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
         """The predicted pose of a scan that follows the last one corrected."""
@@ -252,7 +252,7 @@ class Predictor:
             if largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
                 jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
         elif times.is_gap(interval_s):
-            motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
+            motion = _motion_over(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, is_guess = self.filter.any_motion, True
         else:
             motion, covariance = self.filter.motion, self.filter.predicted(self.by_velocity.covariance)[0]
@@ -275,16 +275,16 @@ class Predictor:
 
     @property
     def doubts_scans(self) -> bool:
-        """True if most of the last scans were lost or contradicted, or one jumped: no evidence against wheels."""
+        """True if most of the last scans were lost or contradicted, or one jumped: they cannot refute wheels."""
         return self.doubtful > _MOST_DOUBTFUL
 
     def drop_wheels(self, scan: Scan, jump_m: float) -> None:
-        """Leave out the reading at this scan, which is off by so much, here and for the motion to the next."""
+        """Reject the reading at this scan, which jumps by ``jump_m``, also for the motion to the next scan."""
         self.is_contradicted = True
         self.jumps.append((scan.index, jump_m))
 
     def warnings(self) -> tuple[str, ...]:
-        """A line on readings of the wheels that were left out."""
+        """A line on wheel readings that were rejected; none without any."""
         if not self.jumps:
             return ()
         longest_m = max(jump_m for _, jump_m in self.jumps)
@@ -294,7 +294,7 @@ class Predictor:
         )
 
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
-        """Take the pose of a scan: that of its match or, where it is lost, the predicted one."""
+        """Update by the pose of a scan: that of its match or, if lost, the predicted one."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
         self.lost_s = self.lost_s + prediction.interval_s if state is State.LOST else 0.0
         if self.intervals.last_scan is not None:
@@ -334,7 +334,7 @@ class Predictor:
     def _wheel_motion(self, scan: Scan) -> Pose | None:
         """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
         if self.config.prior == "constant-velocity" or self.intervals.last_scan is None or scan.clock_jump_s:
-            return None  # their clock may have jumped as well, and they with it
+            return None  # the clock of the wheel readings may have jumped as well
         last, now = self.T_odom_base, scan.T_odom_base
         if now is None and self.config.prior == "wheel":
             raise InputError(
@@ -347,12 +347,12 @@ class Predictor:
         return lie.between(T_base_lidar, lie.between(last, now).dot(T_base_lidar))
 
 
-def _stretched(
+def _motion_over(
     T_previous_current: Pose, interval_s: float, last_s: float, usual_s: float, share: float = 1.0
 ) -> Pose:
-    """The motion at the same velocity over a share of the time that passed.
+    """The motion at the last velocity over a share of the interval.
 
-    Very short intervals give a poor velocity; half the usual one is the shortest used.
+    Very short intervals give a poor velocity: it is computed over half the usual one at least.
     """
     last_s = max(last_s, 0.5 * usual_s)
     if last_s <= 0.0:

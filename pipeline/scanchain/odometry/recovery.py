@@ -1,4 +1,4 @@
-"""Recovery: other initial poses where a match fits badly, wide searches after a loss, and a limit on them."""
+"""Recovery: other initial poses where a match fits poorly, wide searches after a loss, and a limit on them."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from scanchain.registration.align import AMBIGUOUS
 from scanchain.registration.plicp import kernel_scale_of
 from scanchain.registration.search import evenly, upright_columns
 
-_WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
-_PATIENCE = 5  # number of scans lost in a row, from which on the map is extended at the predicted pose
-_UNCERTAIN = 2.0  # cost per point over its running mean, from which on other initial poses are tried
-_ELSEWHERE = 3.0  # cost per point over its running mean, from which on a scan after a gap does not fit the map
+_WIDE_SCANS = 3  # number of scans with a wide search at the start and after a loss, while no velocity is known
+_PATIENCE = 5  # number of consecutive lost scans at which the map is extended at the predicted pose
+_UNCERTAIN = 2.0  # cost per point over its running mean, above which other initial poses are tried
+_ELSEWHERE = 3.0  # cost per point over its running mean, above which a scan after a gap does not fit the map
 _ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is uncertain
-_UNUSUAL = 1.5  # cost per point over its running mean, from which on a contradicted pose in space is searched
-CLEARLY = 0.8  # share of the cost of the present pose, below which another one replaces it
-_SAME_RAD = 0.05  # largest angle between two poses of one minimum, which lie within a voxel
-_SEEDS = 3  # number of poses by upright structure that are aligned
-_COLUMNS = 300  # of upright structure that are scored, evenly spread
-_COLUMNS_APART, _COLUMNS_SHARE = 3.0, 0.6  # of these poses: least distance in voxels, share of the best score
+_UNUSUAL = 1.5  # cost per point over its running mean, above which a contradicted pose in space is searched
+CLEARLY = 0.8  # share of the cost of the current pose, below which another one replaces it
+_SAME_RAD = 0.05  # largest angle between two poses of one minimum; their largest distance is a voxel
+_SEEDS = 3  # number of initial poses from upright structure that are aligned
+_COLUMNS = 300  # columns of upright structure that are scored, evenly spread
+_COLUMNS_APART, _COLUMNS_SHARE = 3.0, 0.6  # of these poses: distance in voxels, share of the best score
 _LONG_S = 1.0  # shortest gap after which a robot may have turned around
-_SEEDS_APART_M, _SEEDS_SHARE = 1.0, 0.8  # of those of the search in the plane: distance, share of the best score
+_SEEDS_APART_M, _SEEDS_SHARE = 1.0, 0.8  # of initial poses in the plane: least distance, share of the best score
 _NEAR_PERCENT = 95.0  # share of the points within the radius of the map that is searched in space
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
@@ -38,7 +38,7 @@ _Aligned = tuple[Match, NDArray[np.float64] | None]
 
 
 class Recovery:
-    """Alignment of scans, also of those far from the predicted pose, by the usual cost of a point."""
+    """Alignment of scans, also far from the predicted pose, judged by the running mean of the cost per point."""
 
     def __init__(self, config: MatchingConfig, matcher: Matcher) -> None:
         self.config, self.matcher = config, matcher
@@ -50,8 +50,8 @@ class Recovery:
     def align(self, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction) -> _Aligned:
         """The alignment from the predicted pose or, where that one is uncertain, the best of several.
 
-        With it the twist (k,) to another pose that fits nearly as well, None where there is none.
-        points : (N, d) those to be aligned; sweep : all of the scan
+        Also the twist (k,) to another pose that fits nearly as well, None where there is none.
+        points : (N, d) to align; sweep : all points of the scan
         """
         wide = self.wide_scans > 0 or prediction.is_guess
         self.rough_cost = _ROUGH * 0.5 * kernel_scale_of(self.config, surfaces) ** 2
@@ -74,25 +74,25 @@ class Recovery:
         return best, rival
 
     def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
-        """True if a scan without a reliable prediction does not fit the map at the pose that was found.
+        """True if a scan without a reliable prediction does not fit the map at the pose found.
 
-        usual_cost : before this scan
+        usual_cost : running mean of the cost per point before this scan
         """
         return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, self.rough_cost)
 
     def gives_up(self, state: State) -> bool:
-        """Count a scan; true if so many were lost in a row that the map has to be extended at the prediction."""
+        """Update the count of lost scans; True if the map has to be extended at the predicted pose."""
         is_lost = state is State.LOST
         self.lost_scans = self.lost_scans + 1 if is_lost else 0
         self.wide_scans = _WIDE_SCANS if is_lost else max(self.wide_scans - 1, 0)
         return self.lost_scans >= _PATIENCE
 
     def forget(self) -> None:
-        """Start with another map, in which the usual cost is unknown."""
+        """Reset the running mean of the cost, for a new map."""
         self.usual_cost = 0.0
 
     def _is_uncertain(self, cost: float, prediction: Prediction) -> bool:
-        """True if the cost per point is far above the usual one, and above a share of the greatest possible."""
+        """True if the cost per point is far above its running mean, and above a share of its maximum."""
         if not self.usual_cost:
             return False
         if prediction.is_guess:
@@ -102,9 +102,9 @@ class Recovery:
     def _searched(
         self, tried: list[Match], points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction
     ) -> Match:
-        """The best alignment in space from where upright structure fits, or the one that there was.
+        """The best alignment in space from poses where upright structure fits, or the given one.
 
-        tried : that one; those that are tried are appended
+        tried : the given alignment; further ones are appended
         """
         structure = sweep.from_middle(prediction.velocity)
         best = tried[0]
@@ -124,7 +124,7 @@ class Recovery:
     def _decided(
         self, best: Match, tried: Sequence[Match], surfaces: VoxelMap, prediction: Prediction
     ) -> _Aligned:
-        """The one nearest to the prediction, of the best alignment and distinct ones that fit nearly as well."""
+        """The alignment nearest to the prediction among the best and distinct ones that fit nearly as well."""
         distinct = [
             match
             for match in tried
@@ -141,17 +141,17 @@ class Recovery:
         return best, lie.log(lie.between(best.T_target_source, rival.T_target_source))
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
-        """Cost of a match and of its distance from the predicted pose, m²."""
+        """Cost of a match plus that of its distance from the predicted pose, m²."""
         return match.cost + 0.5 * self.config.sensor_noise_m**2 * _away(match, prediction)
 
 
 def _is_free(prediction: Prediction) -> bool:
-    """True after a gap so long that any motion within the search window is possible, not after uneven stamps."""
+    """True after so long a gap that any motion within the search window is possible; False for uneven stamps."""
     return prediction.is_guess and prediction.interval_s > _LONG_S
 
 
 def _away(match: Match, prediction: Prediction) -> float:
-    """Squared distance from the predicted pose, in the largest standard deviations of a prediction."""
+    """Squared distance from the predicted pose, in units of the largest standard deviations of a prediction."""
     prior = prediction.prior
     away = lie.log(lie.between(prior.T_target_source, match.T_target_source)) / prior.widest
     return float(away @ away)
@@ -160,9 +160,9 @@ def _away(match: Match, prediction: Prediction) -> float:
 def from_above(
     structure: Points, surfaces: VoxelMap, T_predicted: Pose, window: Window, radius_m: float
 ) -> Iterator[Pose]:
-    """Initial poses in space, the best first: upright structure of scan and map as seen along the lidar's z axis.
+    """Initial poses in space, the best first: upright structure of scan and map projected along the lidar's z.
 
-    window : of the motion in its xy plane; radius_m : half the side of the square of the map that is seen
+    window : of the motion in its xy plane; radius_m : half the side of the square of the map that is used
     """
     size_m = surfaces.voxels.size_m
     means = lie.transform(lie.inverse(T_predicted), surfaces.points())
@@ -179,13 +179,13 @@ def is_sound(match: Match) -> bool:
 
 
 def _is_near(T: Pose, T_other: Pose, size_m: float) -> bool:
-    """True if matching from one pose ends where it does from the other."""
+    """True if two poses are so close that they belong to one minimum."""
     away_m, away_rad = lie.apart(T, T_other)
     return away_m < size_m and away_rad < _SAME_RAD
 
 
 def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tuple[Pose, ...]:
-    """Other initial poses; in the plane also the best of a window around the predicted one."""
+    """Other initial poses; in the plane also the best ones in a window around the predicted pose."""
     alternatives = prediction.alternatives()
     if surfaces.dimension == 3:
         return alternatives

@@ -1,4 +1,4 @@
-"""Standstill: a pose that is held as long as matches agree with one another, though they lie beside it."""
+"""Standstill: a pose that is kept as long as matches agree with each other, even if biased against it."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from scanchain import lie
 from scanchain.data import Match, Pose
 from scanchain.kernels.matrices import definite_inverse
 
-_SCANS = 10  # number of scans that agree with one pose, from which on the lidar stands
-_AGAIN = 30  # the same of scans beside a pose that is held
-_SETTLING = 0.2  # least weight of a match in the mean of the first ones, whose map is that of few scans
-_SETTLING_M, _SETTLING_RAD = 0.004, 0.001  # smallest standard deviation of them
+_SCANS = 10  # number of scans in agreement with one pose that establish a standstill
+_AGAIN = 30  # the same for another pose near the one that is kept
+_SETTLING = 0.2  # least weight of a match in the mean of the first ones, whose map is made of few scans
+_SETTLING_M, _SETTLING_RAD = 0.004, 0.001  # smallest standard deviation of these matches
 _SUDDEN = 5.0  # standard deviations beyond which one innovation contradicts a standstill
 _LASTING = 3.0  # the same for the running mean of the innovations
 _CAUTION = 2.0  # factor from the root mean square to the standard deviation that is used
 _GAIN = 0.3  # least weight of the next value in the running mean of the innovations
 _SCATTER_GAIN = 0.1  # the same in that of the squared steps
-_AVERAGED = 0.25  # least variance of that mean over that of one innovation: errors in a row are alike
-_KNOWN = 5  # number of steps from which on their scatter replaces the variance of a match
+_AVERAGED = 0.25  # least variance of that mean over that of one innovation: errors are correlated
+_KNOWN = 5  # number of steps at which their scatter replaces the variance of a match
 _LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation of a match
 _LARGEST_M, _LARGEST_RAD = 0.01, 0.005  # largest one; weaker matches cannot show a standstill
-_FIRST_M, _FIRST_RAD = 0.015, 0.002  # largest distance of a match to a map of a single scan, whose noise it shares
-_NEAR_M, _NEAR_RAD = 0.02, 0.004  # distance from the mean beyond which (and _SUDDEN) the lidar has set off
+_FIRST_M, _FIRST_RAD = 0.015, 0.002  # largest distance of a match to a map of a single scan, biased by its noise
+_NEAR_M, _NEAR_RAD = 0.02, 0.004  # distance from the mean beyond which (and _SUDDEN) the lidar has moved off
 _SAME_M, _SAME_RAD = 0.002, 0.001  # distance between two means up to which they are one standstill
 
 
 class Standstill:
     """Zero-velocity hypothesis, tested by the innovation of every match against the mean of those before.
 
-    A map of few scans has an error that all matches share: they agree with one another, some millimeters beside.
-    The pose that is held is that of the first scan, or the mean of the first ten after a motion. It follows the
-    mean of the matches where that moves away, not where it comes nearer as the map gets better. People and cars
-    that move past draw matches aside for a while: the lidar stands where it stood unless it sets off, or ten scans
-    in a row agree with another pose.
+    A map of few scans has an error that all matches share: they agree with each other, at an offset of some
+    millimeters. The pose that is kept is that of the first scan, or the mean of the first ten after a motion. It
+    follows the mean of the matches where that moves away, not where it comes nearer as the map improves. People
+    and cars that move past bias matches for a while: the pose is kept unless the lidar moves off, or 30 scans in a
+    row agree with another pose.
 
-    T_odom_lidar : the pose that is held
-    bias : (k,) from it to the mean of the matches
+    T_odom_lidar : the pose that is kept
+    bias : (k,) twist from it to the mean of the matches
     """
 
     def __init__(self, dimension: int) -> None:
@@ -49,19 +49,19 @@ class Standstill:
         self.T_odom_lidar = T_odom_lidar
         self.bias = np.zeros(lie.twist_size(T_odom_lidar))
         self.held: AgreeingMatches | None = None
-        # of the last matches, none of which confirmed it
-        self.beside: AgreeingMatches | None = AgreeingMatches(T_odom_lidar)
+        # of the last matches, none of which confirmed the kept pose
+        self.elsewhere: AgreeingMatches | None = AgreeingMatches(T_odom_lidar)
         self.is_beginning = self.is_settling = False
 
     @property
     def is_standing(self) -> bool:
-        """True if enough scans agreed with one pose, and the lidar has not left it."""
+        """True if enough scans agreed with one pose and the lidar has not moved off."""
         return self.held is not None
 
     def confirms(self, match: Match) -> bool:
-        """True if the lidar stands and the match, which is taken then, does not contradict it.
+        """True if the lidar is at standstill and the match does not contradict it; the match is then added.
 
-        A degenerate match cannot: along a corridor it follows the prediction, which is to stand.
+        False for a degenerate match: along a corridor it follows the prediction, which is a standstill.
         """
         if match.observability < 1.0:
             return False
@@ -74,7 +74,7 @@ class Standstill:
             return self.is_settling
         if self.held is None or not self.held.takes(match, is_settling=self.is_settling):
             return False
-        self.beside = None
+        self.elsewhere = None
         self.is_settling = self.is_settling and self.held.scans < _SCANS
         if self.is_settling:
             self.bias = lie.log(lie.between(self.T_odom_lidar, self.held.T_mean))
@@ -83,29 +83,29 @@ class Standstill:
         return True
 
     def follow(self, match: Match) -> None:
-        """Take a match that does not confirm a standstill: one of several that agree, or the first of them."""
+        """Add a match that does not confirm the standstill: to matches that agree elsewhere, or as their first."""
         sigma = np.sqrt(_variances(match))
         if self.held is not None:
             away = np.abs(lie.log(lie.between(self.held.T_mean, match.T_target_source)))
             if (away > np.maximum(_limits(away, _NEAR_M, _NEAR_RAD), _SUDDEN * sigma)).any():
                 self.held = None
-        if self.beside is None or not self.beside.takes(match):
-            self.beside = AgreeingMatches(match.T_target_source)
-        if self.beside.scans < (_SCANS if self.held is None else _AGAIN):
+        if self.elsewhere is None or not self.elsewhere.takes(match):
+            self.elsewhere = AgreeingMatches(match.T_target_source)
+        if self.elsewhere.scans < (_SCANS if self.held is None else _AGAIN):
             return
         if self.held is None:
-            self.begin(self.beside.T_mean)
-            self.held = self.beside
+            self.begin(self.elsewhere.T_mean)
+            self.held = self.elsewhere
         else:
-            self._hold(self.beside, sigma)
-        self.beside = None
+            self._hold(self.elsewhere, sigma)
+        self.elsewhere = None
 
     def leave(self) -> None:
-        """Forget the pose that was held: another sensor measures the motion."""
+        """End the standstill: another sensor measures the motion."""
         self.held, self.is_beginning = None, False
 
     def _hold(self, mean: AgreeingMatches, sigma: NDArray[np.float64]) -> None:
-        """Move the pose that is held where the mean of the matches moved away from it, by more than sigma (k,)."""
+        """Move the kept pose where the mean of the matches moved away from it, by more than sigma (k,)."""
         assert self.held is not None
         away = lie.log(lie.between(self.T_odom_lidar, mean.T_mean))
         if self.is_settling:
@@ -136,7 +136,7 @@ class AgreeingMatches:
         self.mean_innovation = self.squares = np.zeros(lie.twist_size(T_odom_lidar))
 
     def takes(self, match: Match, *, is_settling: bool = False) -> bool:
-        """True if a match agrees, which is taken then; the mean of the innovations includes it in any case."""
+        """True if a match agrees, and is then added; the mean of the innovations includes it in any case."""
         innovation = lie.log(lie.between(self.T_mean, match.T_target_source))
         variances = _variances(match)
         if self.steps >= _KNOWN:
@@ -162,7 +162,7 @@ class AgreeingMatches:
 
 
 def _variances(match: Match) -> NDArray[np.float64]:
-    """(k,) of a match by its own information, within the limits."""
+    """Variances (k,) of a match from its own information, within the limits."""
     variances = np.diag(definite_inverse(match.information))
     least, largest = _limits(variances, _LEAST_M, _LEAST_RAD), _limits(variances, _LARGEST_M, _LARGEST_RAD)
     return np.clip(variances, least**2, largest**2)

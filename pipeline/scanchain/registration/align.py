@@ -21,17 +21,17 @@ from scanchain.registration.search import SearchGrid, Wanted, Window, evenly, fi
 from scanchain.registration.voxel_map import VoxelMap
 from scanchain.settings import Override, load_settings
 
-_RANGE_VOXELS = {2: 40.0, 3: 14.0}  # that the median distance from the centroid spans, at most
+_RANGE_VOXELS = {2: 40.0, 3: 14.0}  # largest number of voxels that the median distance from the centroid spans
 _WINDOW, _WINDOW_RAD = 0.5, 1.0  # half the window searched in the plane: share of that distance, and angle
-_SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # beginnings in the plane: number, distance, share of the best score
-_SEEN_FROM = 3.0  # times that distance from the centroid, up to which a cloud was seen from its origin
-_ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance from which on two matches are distinct
+_SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # initial poses in the plane: number, distance, share of best score
+_SEEN_FROM = 3.0  # largest distance of a sensor, in the origin, from the centroid, in such median distances
+_ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance above which two matches are distinct
 AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
-_HALVINGS = 2  # of voxels that are tried
-_MOST = 3  # times the number of points wanted, beyond which halved voxels would add work alone
-_SAME = 0.1  # voxels, within which poses found with voxels of two sizes are the same
-_GAIN = 12.5  # times the variance of a range, of cost below which a direction is not worth leaving the guess: 5 σ
-_APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
+_HALVINGS = 2  # largest number of times that voxels are halved
+_MOST = 3  # times the number of points to match, above which more points only cost time
+_SAME = 0.1  # voxels; largest distance of equal poses found at two voxel sizes
+_GAIN = 12.5  # least decrease of cost, in variances of a range, to leave the guess along a weak direction: 5 σ
+_APART = 10.0  # times that distance between the centroids, above which the clouds cannot overlap
 
 
 def align(
@@ -42,22 +42,22 @@ def align(
     voxel_size_m: float | None = None,
     matcher: str = "plicp",
 ) -> Match:
-    """The pose of a cloud in the frame of another.
+    """Match of a cloud to another one, whose frame the pose refers to.
 
     Both clouds are moved to their centroids and scaled so that a voxel has the preset's size; the other lengths
-    (search radius, kernel scale, tolerance) are the preset's, too. The unit of the clouds is therefore free: where
-    the text says meters, read that unit.
+    (search radius, kernel scale, tolerance) are the preset's, too. The clouds may therefore be in any unit, which
+    replaces meters below.
 
     target, source : (N, d) and (M, d), d = 2 or 3, meters; rows that are not finite are left out
-    T_guess : (d+1, d+1), the identity where left out; motions of about three voxels are found from there, in the
-        plane shifts by half the target's median range and turns of 1 rad about the origin of the source, or about
-        its centroid where the origin is far off (branch and bound; Olson 2009, Hess et al. 2016)
-    voxel_size_m : of the map made of the target; where left out, a fraction of the target's extent such that about
-        a point lies in each voxel of a surface, or more
+    T_guess : (d+1, d+1), the identity where left out; motions of about three voxels are found from there; in the
+        plane, shifts by half the target's median range and turns of 1 rad about the origin of the source, or about
+        its centroid where the origin is far away (branch and bound; Olson 2009, Hess et al. 2016)
+    voxel_size_m : of the map made of the target; where left out, a fraction of the target's extent such that each
+        voxel on a surface holds about one point or more
     matcher : "plicp" or "svd"
     Returns the match: ``T_target_source``, ``information`` (k, k) of a right perturbation of it, ``inliers``,
     ``residual_m``, ``observability``, ``converged`` and ``reason``.
-    Raises InputError naming the argument that is no cloud, pose, size or matcher.
+    Raises InputError naming an argument that is not a valid cloud, pose, size or matcher.
     """
     d = checks.dimension_of(target, "target")
     target, source = _valid(target, "target", d), _valid(source, "source", d)
@@ -98,10 +98,10 @@ def align(
 def _at_another_scale(
     match: Match, matched: Callable[[float, Pose], Match], size_m: float, finest_m: float
 ) -> Match:
-    """The match with other voxels, where these are too coarse for a body or too fine for rough surfaces.
+    """The match with other voxels, where these are too coarse for an object or too fine for rough surfaces.
 
-    Voxels that hold both sides of a plank leave its pose undetermined: halved ones are tried, as fine as points
-    allow. Surfaces rougher than the kernel is wide contradict any pose: doubled ones are tried.
+    Voxels that hold both sides of a plank leave its pose undetermined: halved ones are tried, as fine as the point
+    density allows. Surfaces rougher than the width of the kernel contradict any pose: doubled ones are tried.
     """
     for _ in range(_HALVINGS):
         if match.observability >= 1.0 or size_m <= finest_m:
@@ -109,11 +109,11 @@ def _at_another_scale(
         size_m = max(0.5 * size_m, finest_m)
         finer = matched(size_m, match.T_target_source)
         if finer.fit >= LEAST_FIT and finer.observability > match.observability:
-            is_clear = finer.observability >= WEAK or not finer.converged  # a weak one is the sampling's, perhaps
+            is_clear = finer.observability >= WEAK or not finer.converged  # a weak one may be due to the sampling
             match = finer if is_clear else replace(finer, converged=False, reason=match.reason, cause=match.cause)
     if match.fit < LEAST_FIT and match.observability >= 1.0:
         coarser = matched(2.0 * size_m, match.T_target_source)
-        if coarser.converged:  # what one scale finds, the other confirms
+        if coarser.converged:  # found at one scale, confirmed at the other
             again = matched(size_m, coarser.T_target_source)
             apart_m, apart_rad = lie.apart(again.T_target_source, coarser.T_target_source)
             if again.converged or (apart_m < _SAME * size_m and apart_rad < _ELSEWHERE_RAD):
@@ -122,7 +122,7 @@ def _at_another_scale(
 
 
 def _valid(cloud: AnyPoints, name: str, d: int) -> Points:
-    """The finite ones of its points. Raises InputError where there are none."""
+    """The finite points of a cloud. Raises InputError where there are none."""
     points, _ = checks.valid_points(cloud, name, d)
     if not len(points):
         raise InputError(f"{name} has no points that are finite; wanted (N, {d}) with N of at least a few hundred")
@@ -132,12 +132,12 @@ def _valid(cloud: AnyPoints, name: str, d: int) -> Points:
 def _matched(
     target: Points, source: Points, T_first: Pose, T_pivot_source: Pose, range_m: float, config: Config
 ) -> Match:
-    """The match of two clouds that fit the configuration; in the plane the best of several about a pivot."""
+    """The match of two clouds in the configured scale; in the plane the best of several turns about a pivot."""
     local_map, sizes = VoxelMap(target.shape[1], config.local_map), config.preprocess
     local_map.insert(downsample(target, sizes.map_voxel_m), lie.identity(target.shape[1]))
     sparse = downsample(source, sizes.match_voxel_m)
     finer = math.sqrt(len(sparse) / sizes.match_points)
-    if finer < 1.0:  # voxels by so much, so that about as many points as wanted remain
+    if finer < 1.0:  # of voxels, so that about as many points as configured remain
         sparse = downsample(source, max(finer * sizes.match_voxel_m, sizes.map_voxel_m))
     sparse = evenly(sparse, _MOST * sizes.match_points)
     matcher = create_matcher(config.matching)
@@ -158,7 +158,7 @@ def _matched(
 
 
 def _unambiguous(matches: Sequence[Match]) -> Match:
-    """The match of the lowest cost, not converged where one elsewhere fits nearly as well."""
+    """The match of lowest cost, not converged where a distinct one fits nearly as well."""
     best = min(matches, key=lambda match: match.cost)
     for other in matches:
         apart_m, apart_rad = lie.apart(best.T_target_source, other.T_target_source)
@@ -169,13 +169,13 @@ def _unambiguous(matches: Sequence[Match]) -> Match:
 
 
 def as_ambiguous(match: Match, apart_m: float, apart_rad: float) -> Match:
-    """The same match, not converged because a pose so far away fits nearly as well."""
+    """The same match, not converged because a pose at this distance fits nearly as well."""
     reason = f"ambiguous: a pose {apart_m:.2g} m away, turned by {apart_rad:.2f} rad, fits nearly as well"
     return replace(match, converged=False, reason=reason, cause="ambiguous: another pose fits nearly as well")
 
 
 def _restored(match: Match, unit_m: float) -> Match:
-    """A match of scaled clouds as one of clouds in the unit that came."""
+    """A match of scaled clouds, converted to the unit of the given clouds."""
     units = lie.by_component(len(match.information), unit_m, 1.0)
     return replace(
         match,
@@ -190,7 +190,7 @@ def _restored(match: Match, unit_m: float) -> Match:
 
 
 def _in_units_of(reason: str, unit_m: float) -> str:
-    """A reason, its lengths in the unit of the clouds that came; without keys, which ``align`` does not take."""
+    """A reason with lengths in the unit of the given clouds, without configuration keys, which ``align`` lacks."""
     named = re.sub(r"matching\.kernel_scale_m \((\S+)\)", r"the kernel scale of \1 m", reason)
     named = re.sub(r"local_map\.voxel_size_m \((\S+)\)", r"voxel_size_m (\1 m)", named)
     named = named.replace("matching.", "").replace("local_map.", "")
@@ -198,7 +198,7 @@ def _in_units_of(reason: str, unit_m: float) -> str:
 
 
 def with_source_frame(match: Match, T_new_old: Pose) -> Match:
-    """The same match with the source seen from another frame that moves with it: ξ of T is Ad(T_new_old) ξ."""
+    """The same match with another frame fixed to the source: ξ of T becomes Ad(T_new_old) ξ."""
     T_old_new = lie.inverse(T_new_old)
     direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
     Ad_inverse = lie.adjoint(T_old_new)

@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 
-PAIR_M, _TURN_M_RAD = 0.3, 0.5  # path of a pair of motions, and that of a turn on the spot
-_FEWEST, _LEARNED = 6, 1.2  # pairs, for four numbers; growth of their count after which they are solved once more
-_ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; residuals at first, and at least
-_PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information of a place within 1 m, nearly none of the rest
-_LARGEST_SHARE = 0.25  # of the motions that is left as residual, above which no mounting explains them
-_YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of what is observable
-_OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # correlation of turns, and these over the log, that show a lidar upside down
-_APART_M, _EXPLAINED = 0.2, 0.5  # distance above, and share of the residual below which a mounting is another
+PAIR_M, _TURN_M_RAD = 0.3, 0.5  # least path length of a pair of motions; path length per rad of rotation
+_FEWEST, _LEARNED = 6, 1.2  # least number of pairs, for four unknowns; growth of it before the next estimate
+_ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; initial and smallest σ of a residual
+_PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information: position to 1 m, the rest nearly free
+_LARGEST_SHARE = 0.25  # residual as a share of the motions, above which no mounting explains them
+_YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of an observable yaw and position
+_OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # least negative correlation of turns, and turn, to find a lidar upside down
+_APART_M, _EXPLAINED = 0.2, 0.5  # least offset and largest ``left`` of a mounting other than identity
 
 
 class HandEye(NamedTuple):
-    """The mounting T_base_lidar (d+1, d+1) by the motions: level, its place 0 where not observable, z always.
+    """The mounting T_base_lidar (d+1, d+1) from motions: level, its position 0 where not observable, z always 0.
 
-    sigma_rad, sigma_m : of its yaw and its place
-    left : share that it leaves of the residuals as if lidar and base were one
+    sigma_rad, sigma_m : standard deviations of its yaw and position
+    left : its residual as a share of that of the identity mounting
     """
 
     T_base_lidar: Pose
@@ -34,12 +34,12 @@ class HandEye(NamedTuple):
 
     @property
     def is_mirrored(self) -> bool:
-        """True if a planar lidar turns against the base, as one does that hangs upside down."""
+        """True if a planar lidar turns opposite to the base, as when mounted upside down."""
         return len(self.T_base_lidar) == 3 and bool(np.linalg.det(self.T_base_lidar) < 0.0)
 
     @property
     def is_apart(self) -> bool:
-        """True if lidar and base are clearly not one: motions that disagree by far are explained."""
+        """True if the mounting clearly differs from the identity and explains the motions far better."""
         is_turned = abs(float(lie.yaw(self.T_base_lidar))) > _YAW_RAD + 3.0 * self.sigma_rad
         is_moved = np.linalg.norm(self.T_base_lidar[:2, -1]) > _APART_M
         return bool(is_turned or is_moved) and self.left < _EXPLAINED
@@ -50,9 +50,9 @@ class HandEye(NamedTuple):
         yaw_deg = (float(np.degrees(lie.yaw(self.T_base_lidar))) + 90.0) % 360.0 - 90.0
         turned = f"lidar turned by {yaw_deg:.1f} ± {np.degrees(self.sigma_rad):.1f} deg"
         if len(self.T_base_lidar) == 4:
-            turned += f" and {'upside down' if self.T_base_lidar[2, 2] < 0.0 else 'upright'}, level as is assumed"
+            turned += f" and {'upside down' if self.T_base_lidar[2, 2] < 0.0 else 'upright'}, assumed level"
         if self.sigma_m >= _PLACE_M:
-            return f"{turned}; its place is not observable: the log hardly turns"
+            return f"{turned}; its position is not observable: the log hardly turns"
         x_m, y_m = self.T_base_lidar[:2, -1]
         ahead, aside = "ahead of" if x_m >= 0.0 else "behind", "left" if y_m >= 0.0 else "right"
         place = f"{abs(x_m):.2f} m {ahead} the base, {abs(y_m):.2f} m to its {aside}"
@@ -60,13 +60,13 @@ class HandEye(NamedTuple):
 
 
 def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
-    """The mounting X of a lidar on a base by motions (M, d+1, d+1) of both: B X = X L.
+    """The mounting X of a lidar on a base from motions (M, d+1, d+1) of both: B X = X L.
 
-    In the plane, with t the place, θ the turn, (a, b) = ρ (cos φ, sin φ) the yaw φ and the scale ρ of the wheels,
+    In the plane, with position t, turn θ and (a, b) = ρ (cos φ, sin φ) of the yaw φ and the scale ρ of the wheels,
         (R(θ) − I) ρ t − [a, −b; b, a] t_L = −t_B
     is linear in four numbers (after Censi, Franchi, Marchionni & Oriolo 2013), solved by reweighted least squares
-    (Cauchy). Motions in space are taken for those of a level lidar, upside down where it turns against the base.
-    None where no mounting explains them, or several do: at rest, in one curve or on the spot.
+    (Cauchy). In space the lidar is assumed level, upside down where it turns opposite to the base.
+    None where no mounting explains the motions, or several do: at rest, on one curve or turning on the spot.
     """
     if len(base) < _FEWEST:
         return None
@@ -80,7 +80,7 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
     sigma_m, scale = float(np.sqrt(covariance[:2, :2].diagonal().max())), float(np.hypot(*p[2:]))
     if scale < _LARGEST_SHARE:
         return None
-    across = np.array([-p[3], p[2]]) / scale**2  # the yaw's derivative
+    across = np.array([-p[3], p[2]]) / scale**2  # derivative of the yaw
     sigma_rad = float(np.sqrt(across @ covariance[2:, 2:] @ across))
     if residual_m > _LARGEST_SHARE * float(np.median(path_m(base))) or sigma_rad > _YAW_RAD:
         return None
@@ -110,22 +110,22 @@ def _solved(J: Matrix, z: Matrix) -> tuple[NDArray[np.floating], NDArray[np.floa
 
 
 class MountingEstimator:
-    """The mounting of a lidar, where none is stated estimated by the motions of all scans so far.
+    """The mounting of a lidar: as stated, or else estimated from the motions of all scans so far.
 
-    Until it is known, the wheels are no prior, except for scans after one whose pose is open.
+    Until it is known, wheel odometry is not used as prior, except after a scan whose pose is undetermined.
     """
 
     def __init__(self, T_base_lidar: Pose, *, is_stated: bool) -> None:
         self.T_base_lidar, self.is_stated = T_base_lidar, is_stated
         self.motions: list[tuple[Pose, Pose]] = []  # of base and lidar
-        self.last: tuple[Pose, Pose] | None = None  # their poses that the next motions begin at
+        self.last: tuple[Pose, Pose] | None = None  # their poses at which the next motions begin
         self.has_wheels = False
         self.due = 0  # number of motions above which the next estimate is made
         self.found: HandEye | None = None
-        self.is_usable = is_stated  # the wheels, for the next scan
+        self.is_usable = is_stated  # whether wheel odometry is usable for the next scan
 
     def take(self, T_odom_lidar: Pose, T_odom_base: Pose | None, *, is_open: bool) -> None:
-        """Take the poses of a scan."""
+        """Add the poses of a scan; ``is_open`` if that of the lidar is undetermined."""
         if self.is_stated:
             return
         self.has_wheels |= T_odom_base is not None
@@ -143,15 +143,15 @@ class MountingEstimator:
         self.is_usable = is_open if self.found is None else not self.found.is_mirrored
 
     def finish(self) -> str:
-        """Estimate it by all scans; what is known of it as a sentence, empty where stated or without wheels."""
+        """Estimate the mounting from all scans; the result in words, "" where stated or without wheels."""
         if not self.has_wheels:
             return ""
         self._estimate()
         if self.found is None:
-            why = "the wheels do not show it: at rest, in one curve only, or in other motions than the lidar"
+            why = "the wheels do not determine it: at rest, on one curve only, or contradicting the lidar"
             return f"mounting assumed, as if the lidar sat at the base's origin: no transform states it, and {why}"
         if self.found.is_mirrored:
-            why = "as one does that hangs upside down, which no transform states: --log.upside_down true"
+            why = "as when mounted upside down, which no transform states: --log.upside_down true"
             return f"the wheels are not used: the lidar turns left where they turn right, {why}"
         return f"mounting estimated from the wheels: {self.found.text}; the log has no transform"
 

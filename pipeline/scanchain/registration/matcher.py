@@ -1,4 +1,4 @@
-"""Matchers: the protocol, and the one that the configuration names."""
+"""Matchers: the protocol, and creation of the one that the configuration names."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ _NUMBERS = ("cost", "residual_m", "fit", "degeneracy_eigenvalue", "observability
 class Matcher(Protocol):
     """Scan-to-map registration; made with a MatchingConfig.
 
-    Stateless: a match follows from the arguments and the configuration alone. A run that is resumed makes its
-    matcher again from the name and the configuration.
+    Stateless: a match depends on the arguments and the configuration alone. A resumed run recreates its matcher
+    from the name and the configuration.
     """
 
     def align(
         self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the first one.
+        """Pose of the scan in the map's frame, near the initial one.
 
         points : (N, d) meters, lidar frame
         target : ``target.points()`` are its voxel means (V, d), map frame; ``target.voxels`` is for kernels
-        T_first : (d+1, d+1), where the search begins
+        T_first : (d+1, d+1), initial pose
         prior : predicted pose and its covariance, None where nothing is predicted
-        wide : search far, for a first pose that is little more than a guess
+        wide : use a larger search radius, for an inaccurate initial pose
         """
         ...
 
 
 class CheckedMatcher:
-    """A class of the user's as a ``Matcher``. Raises InputError where it returns no sound Match."""
+    """A user-defined class as a ``Matcher``. Raises InputError where it does not return a valid Match."""
 
     def __init__(self, name: str, kind: type, config: MatchingConfig) -> None:
         self.name = name
@@ -49,7 +49,7 @@ class CheckedMatcher:
     def align(
         self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """The result of the user's ``align``, its arrays of the shape and dtype wanted."""
+        """The result of the user's ``align``, with arrays of the required shape and dtype."""
         with plugins.own_code(f"{self.name}: align"):
             match = self.own.align(points, target, T_first, prior, wide=wide)
         with plugins.own_code(self.name):
@@ -74,7 +74,7 @@ class CheckedMatcher:
 
 
 def create_matcher(config: MatchingConfig) -> Matcher:
-    """The matcher that the configuration names. Raises InputError where a user's class cannot be had."""
+    """The matcher that the configuration names. Raises InputError where a user-defined class cannot be loaded."""
     checks.instance(config, MatchingConfig, "config", "load_settings(dimension).config.matching")
     name = config.matcher
     kind = plugins.load(MATCHERS.get(name, name), "align")

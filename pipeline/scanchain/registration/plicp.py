@@ -24,11 +24,11 @@ OPTIMIZERS = {
     "levenberg-marquardt": icp.LEVENBERG_MARQUARDT,
 }
 
-_REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searched for sure; voxels
-_LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
-_REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
+_REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is always searched; limit in voxels
+_LEAST_OVERLAP = 0.75  # least share of points with a correspondence; correct poses in simulations exceed it
+_REDUNDANCY = 10  # correspondences on surfaces per degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
-_KERNEL_SIGMAS = 4.0  # least scale of the kernel in standard deviations of a range
+_KERNEL_SIGMAS = 4.0  # least kernel scale, in standard deviations of a range
 _ENDINGS = {
     icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",
@@ -49,10 +49,10 @@ class PointToShapeMatcher:
     def align(
         self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the first one; arguments as ``Matcher.align``.
+        """Pose of the scan in the map's frame, near the initial one; arguments as ``Matcher.align``.
 
-        The covariance of the prior sets the first scale of the kernel.
-        Raises InputError where points or first pose do not fit the map.
+        The covariance of the prior sets the initial kernel scale.
+        Raises InputError where points or initial pose do not fit the map.
         """
         points, T_first = checked(points, target, T_first)
         result = match(
@@ -62,7 +62,7 @@ class PointToShapeMatcher:
 
 
 def checked(points: AnyPoints, target: VoxelMap, T_first: Pose) -> tuple[Points, Pose]:
-    """Points and first pose of an alignment to a map. Raises InputError where they do not fit it."""
+    """Points and initial pose of an alignment, validated. Raises InputError where they do not fit the map."""
     checks.instance(target, VoxelMap, "target", "target = VoxelMap(3, config.local_map); target.insert(points, T)")
     sound = checks.points(points, "points", target.dimension)
     T_first = checks.pose(T_first, "T_first", target.dimension)
@@ -71,7 +71,7 @@ def checked(points: AnyPoints, target: VoxelMap, T_first: Pose) -> tuple[Points,
 
 
 def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Settings:
-    """The configuration as kernels take it; where ranges are noisier than it says, lengths of residuals grow."""
+    """The settings of the kernels; residual scales grow where ranges are noisier than configured."""
     wide = checks.truth(wide, "wide")
     kernel_scale_m = kernel_scale_of(config, target)
     return Settings(
@@ -94,17 +94,17 @@ def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Sett
 
 
 def kernel_scale_of(config: MatchingConfig, target: VoxelMap) -> float:
-    """Scale of the kernel on residuals, meters: the one configured, or that of noisier ranges."""
+    """Scale of the robust kernel, meters: the one configured, or a larger one for noisier ranges."""
     return max(config.kernel_scale_m, _KERNEL_SIGMAS * target.noise_m)
 
 
 def _reach(max_distance_m: float, target: VoxelMap) -> int:
-    """Neighboring voxels searched in each direction, for the largest distance of a correspondence."""
+    """Number of voxels to search in each direction for this largest distance of a correspondence."""
     return min(math.ceil(_REACH * max_distance_m / target.config.voxel_size_m), _LARGEST_REACH)
 
 
 def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConfig) -> Match:
-    """The match of so many points by a kernel's result."""
+    """The match from a kernel's result for this number of points."""
     observability = min(
         _ratio(result.eigenvalue, config.min_information), _ratio(result.signal, config.min_signal)
     )
@@ -203,7 +203,7 @@ def _ratio(known: float, least: float) -> float:
 
 
 def expected(prior: Prior | None, T_first: Pose) -> Prior:
-    """The prior as kernels take it; without one the first pose, of no information."""
+    """The prior for the kernels; without one, the initial pose with zero information."""
     if prior is None:
         k = lie.twist_size(T_first)
         return Prior(np.ascontiguousarray(T_first), np.zeros((k, k)), np.full(k, np.inf))

@@ -1,4 +1,4 @@
-"""Correlative search: poses of points of the plane in a grid, in a window or anywhere (Olson 2009)."""
+"""Correlative scan matching: poses of planar points in a grid, within a window or anywhere (Olson 2009)."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from scanchain.kernels.search import NEAR, SURFACE, TURNS, climb, score_windows,
 from scanchain.preprocess import downsample
 from scanchain.registration.voxel_map import VoxelMap
 
-_TOP = 2  # levels of the pyramid above the grid itself; windows start with 2² cells: larger ones rule out little
+_TOP = 2  # levels of the pyramid above the grid itself; windows start with 2² cells: larger ones prune little
 _SIZE = 2**_TOP
-_MIN_RANGE = 10.0  # least median range, cells, that sets the step of the headings
-_ADDITIONS = 250_000_000  # of scores in one slice of a search, 20 to 40 ms
-_STEPS = 150_000  # windows that are split in one slice
-_POINTS = 120  # of a planar scan that are scored, one a cell, evenly spread
-_TALL = 0.75  # cells between the lowest and the highest point of a column, from which on it is upright structure
+_MIN_RANGE = 10.0  # least median range, in cells, for the step of the headings
+_ADDITIONS = 250_000_000  # of scores per slice of a search, 20 to 40 ms
+_STEPS = 150_000  # windows that are split per slice
+_POINTS = 120  # largest number of points of a planar scan that are scored, one per cell, evenly spread
+_TALL = 0.75  # cells between lowest and highest point of a column, above which it is upright structure
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Poses around one (3, 3), by so much along x and along y, and in heading."""
+    """Poses around a center (3, 3): largest offset along x and y, and in heading."""
 
     T_target_source: Pose
     half_width_m: float
@@ -38,10 +38,10 @@ class Window:
 class Wanted(NamedTuple):
     """Poses that a search is to find.
 
-    apart_m : least distance of two distinct poses, or 0.1 rad
-    rival : share of the best score, from which on further ones are found
+    apart_m : least distance between two distinct poses; or they differ by 0.1 rad
+    rival : share of the best score that further ones reach at least
     answers : largest number of poses
-    least : share of the highest score, below which nothing counts
+    least : share of the maximum score that any pose reaches at least
     """
 
     apart_m: float
@@ -52,26 +52,27 @@ class Wanted(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A pose (3, 3), to within a cell, and its score as a share of the highest that the points could have."""
+    """A pose (3, 3), to within a cell, and its score as a share of the maximum for these points."""
 
     T_target_source: Pose
     share: float
 
 
 class SearchGrid:
-    """Scores of a point in each cell of a grid: 2 on a surface, 1 beside one, 0 elsewhere, −2 in free space."""
+    """Scores of a point in each cell of a grid: 2 on a surface, 1 next to one, 0 elsewhere, −2 in free space."""
 
     def __init__(
         self, cells: NDArray[np.int8], origin_m: Points, resolution_m: float, room: NDArray[np.bool_] | None = None
     ) -> None:
-        """Take scores, row along y.
+        """Pad the scores and build their pyramid.
 
+        cells : (rows, columns), row along y
         origin_m : (2,) corner of cell (0, 0)
-        room : cells that the lidar can be in, where it is searched anywhere
+        room : cells that may contain the lidar, for a search without a window
         """
         self.resolution_m = resolution_m
         self.origin_m = origin_m - _SIZE * resolution_m
-        layer = np.pad(cells, _SIZE)  # windows begin before the first cell
+        layer = np.pad(cells, _SIZE)  # windows may start before the first cell
         self.room = np.zeros(layer.shape, np.bool_)
         if room is not None:
             self.room[_SIZE:-_SIZE, _SIZE:-_SIZE] = room
@@ -79,14 +80,14 @@ class SearchGrid:
         self.pyramid[0] = layer
         for level in range(_TOP):
             self.pyramid[level + 1] = _best_of_four(self.pyramid[level], 1 << level)
-        wider = np.roll(_best_of_four(self.pyramid[_TOP], _SIZE // 2), 1, axis=(0, 1))  # a cell on each side
+        wider = np.roll(_best_of_four(self.pyramid[_TOP], _SIZE // 2), 1, axis=(0, 1))  # by a cell on each side
         self.blocks = np.ascontiguousarray(_in_blocks(wider).transpose(1, 3, 0, 2))
 
     @classmethod
     def of_points(
         cls, points: Points, resolution_m: float, near: Points | None = None, reach_m: float = 0.0
     ) -> SearchGrid:
-        """The surfaces at points (V, 2), meters; there is room within reach of some positions (K, 2)."""
+        """Grid of the surfaces at points (V, 2), meters; ``room`` is all within reach of positions (K, 2)."""
         positions = np.empty((0, 2)) if near is None else near
         extent = np.vstack([points, positions - reach_m, positions + reach_m])
         origin_m = extent.min(axis=0) - 2.0 * resolution_m if len(extent) else np.zeros(2)
@@ -101,25 +102,25 @@ class SearchGrid:
 
     @classmethod
     def of_voxels(cls, target: VoxelMap, center: Pose, radius_m: float = math.inf) -> SearchGrid:
-        """The surfaces of a planar voxel map within a square around a pose, with cells as large as its voxels."""
+        """Grid of the surfaces of a planar voxel map in a square around a pose, one cell per voxel."""
         means = target.points()
         means = means[np.abs(means - center[:2, 2]).max(axis=1, initial=0.0) <= radius_m]
         return cls.of_points(means, target.voxels.size_m)
 
     def climbed(self, points: Points, T: Pose, step_rad: float) -> Found:
-        """The best pose of points (N, 2) near by, in steps of half a cell and so many radians, then smaller."""
+        """Local maximum of the score of points (N, 2), in steps of half a cell and ``step_rad``, then finer."""
         pose = np.array([*T[:2, 2], lie.yaw(T)])
         score = climb(self.pyramid[0], points, self.origin_m, self.resolution_m, pose, step_rad)
         return Found(lie.pose_2d(*pose.tolist()), float(score) / SURFACE)
 
 
 class Search:
-    """Search for points in a grid, in slices of equal work, so that no scan of a live stream waits long."""
+    """Search for points in a grid, in slices of equal work, so that it does not delay scans of a live stream."""
 
     def __init__(self, points: Points, grid: SearchGrid, region: Window | None, wanted: Wanted) -> None:
-        """Begin to search for points (N, 2), meters, lidar frame; at a pose of the region or anywhere with room.
+        """Start a search for points (N, 2), meters, lidar frame; within the region or in all cells with ``room``.
 
-        Turns are in steps that move a point at the median range by one cell.
+        Headings are in steps that move a point at the median range by one cell.
         """
         size_m = grid.resolution_m
         ranges_m = np.hypot(points[:, 0], points[:, 1])
@@ -138,11 +139,11 @@ class Search:
             T = region.T_target_source
             self.begin = np.append(T[:2, 2] - shifts * size_m, lie.yaw(T) - half * self.turn_rad)
         self.grid, self.wanted = grid, wanted
-        mixed = np.random.default_rng(0).permutation(points)  # so that poor poses are given up after a few points
+        mixed = np.random.default_rng(0).permutation(points)  # so that poor poses are rejected after a few points
         self.cells = self._turned(mixed, turns)
         blocks = _in_blocks(self.room)
         self.has_room = np.asarray(blocks.any(axis=(1, 3)))
-        past_last = self.has_room.shape[1] - self.has_room[:, ::-1].argmax(axis=1)  # in each row, if any has room
+        past_last = self.has_room.shape[1] - self.has_room[:, ::-1].argmax(axis=1)  # per row, if any has room
         self.spans = np.column_stack([self.has_room.argmax(axis=1), past_last * self.has_room.any(axis=1)])
         self.full = SURFACE * len(points)
         self.least = max(wanted.least * self.full, 1.0)
@@ -157,7 +158,7 @@ class Search:
 
     @property
     def is_done(self) -> bool:
-        """True once nothing is left that could score better."""
+        """True once no remaining window could score better."""
         return self.turn >= len(self.cells) and not len(self.windows) and self.split[0] == len(self.scored[0])
 
     def advance(self) -> None:
@@ -199,7 +200,7 @@ class Search:
 
 
 def find(points: Points, grid: SearchGrid, region: Window | None, wanted: Wanted) -> Sequence[Found]:
-    """The best poses of points (N, 2), meters, lidar frame, in a region or anywhere with room, the best first."""
+    """The best poses of points (N, 2), meters, lidar frame, in a region or wherever the grid has ``room``."""
     search = Search(points, grid, region, wanted)
     while not search.is_done:
         search.advance()
@@ -207,7 +208,7 @@ def find(points: Points, grid: SearchGrid, region: Window | None, wanted: Wanted
 
 
 def draw_surfaces(cells: NDArray[np.int8], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
-    """Score surfaces in some cells, and what is beside them; none lies on the border."""
+    """Set the scores of cells with surfaces, and of their neighbors; none may lie on the border."""
     for row in (rows - 1, rows, rows + 1):
         for column in (columns - 1, columns, columns + 1):
             cells[row, column] = np.maximum(cells[row, column], NEAR)
@@ -215,19 +216,19 @@ def draw_surfaces(cells: NDArray[np.int8], rows: NDArray[np.int64], columns: NDA
 
 
 def evenly(points: Points, most: int) -> Points:
-    """At most so many of the points (N, d), at even steps."""
+    """At most ``most`` of the points (N, d), at even steps."""
     return np.ascontiguousarray(points[:: max(math.ceil(len(points) / most), 1)])
 
 
 def thinned(points: Points, size_m: float) -> Points:
-    """Some of the points (N, 2) of a scan, one a cell."""
+    """Points (N, 2) of a scan, downsampled to one per cell and at most _POINTS."""
     return evenly(downsample(points, size_m), _POINTS)
 
 
 def upright_columns(points: Points, size_m: float) -> Points:
     """Mean (x, y) of every column (M, 2) whose points (N, 3) span more than _TALL of its width in height.
 
-    Walls, trunks and cars are upright structure. The ground is not, and so it attracts no pose.
+    Walls, trunks and cars are upright structure. The ground is not, and so does not affect the score.
     """
     if not len(points):
         return np.empty((0, 2))
@@ -248,7 +249,7 @@ def _cells(points: Points, origin_m: Points, size_m: float) -> NDArray[np.int64]
 
 
 def _best_of_four(layer: NDArray[np.int8], half: int) -> NDArray[np.int8]:
-    """Best score in each cell, and so many cells on along either axis and along both."""
+    """Best score of each cell and those ``half`` cells further along x, y and both."""
     best = layer.copy()
     np.maximum(best[:, :-half], layer[:, half:], out=best[:, :-half])
     np.maximum(best[:-half], best[half:], out=best[:-half])
@@ -256,7 +257,7 @@ def _best_of_four(layer: NDArray[np.int8], half: int) -> NDArray[np.int8]:
 
 
 def _in_blocks(cells: NDArray[Any]) -> NDArray[Any]:
-    """Cells (rows, 2², columns, 2²) by blocks, padded with zeros."""
+    """Cells in blocks (rows, 2², columns, 2²), padded with zeros."""
     rows, columns = -(-np.array(cells.shape) // _SIZE)
     padded = np.zeros((rows * _SIZE, columns * _SIZE), cells.dtype)
     padded[: cells.shape[0], : cells.shape[1]] = cells

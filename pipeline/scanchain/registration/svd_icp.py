@@ -1,4 +1,4 @@
-"""SVD-ICP: closest points on the surfaces of a voxel map and the closed-form rigid transformation, in turn."""
+"""SVD-ICP: alternates closest points on a voxel map's surfaces with the closed-form rigid transformation."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from scanchain.kernels.registration.match import assess
 from scanchain.registration.plicp import checked, expected, match_of, settings_of
 from scanchain.registration.voxel_map import VoxelMap
 
-_RELAXATION = 1.5  # factor on a step of the closed form, of which one below 2 raises no cost
-_LEFT = 0.1  # share of the tolerances below which a step has converged: what is left may be so many times as much
+_RELAXATION = 1.5  # over-relaxation of a closed-form step; below 2 it does not raise the cost
+_LEFT = 0.1  # share of the tolerances below which a step has converged: the error left may be 1/_LEFT as large
 _RANK_TOLERANCE = 1e-9  # of the largest singular value
-_ROUNDINGS = 64.0  # of the products of the means, below which a singular value is noise
+_ROUNDINGS = 64.0  # rounding errors of the products of the means, below which a singular value is noise
 
 
 class DegeneratePairsError(ScanchainError):
-    """The pairs leave a rotation free: all on one point, or in 3D on one line."""
+    """Correspondences that do not determine the rotation: all on one point, or in 3D on one line."""
 
 
 def rigid_transform(source: AnyPoints, target: AnyPoints, weight: NDArray[np.floating] | None = None) -> Pose:
@@ -31,9 +31,9 @@ def rigid_transform(source: AnyPoints, target: AnyPoints, weight: NDArray[np.flo
     With centered x' and y' and W = Σ wᵢ x'ᵢ y'ᵢᵀ = U Σ Vᵀ,
         R = V diag(1, …, det(V Uᵀ)) Uᵀ        t = μ_y − R μ_x
     (Arun, Huang & Blostein 1987; the determinant after Umeyama 1991, eq. 43; weights after Sorkine-Hornung &
-    Rabinovich 2017, eq. 22). Without the determinant noisy or planar points give a reflection.
+    Rabinovich 2017, eq. 22). Without the determinant, noisy or planar points may give a reflection.
 
-    source, target : (N, d) meters, pair by pair; weight : (N,), ≥ 0, 1 where left out
+    source, target : (N, d) meters, corresponding row by row; weight : (N,), ≥ 0, 1 where left out
     Raises DegeneratePairsError where W leaves the rotation undetermined: rank below d − 1.
     """
     d = checks.dimension_of(source, "source")
@@ -72,17 +72,17 @@ class SvdMatcher:
     def align(
         self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the first one; arguments as ``Matcher.align``.
+        """Pose of the scan in the map's frame, near the initial one; arguments as ``Matcher.align``.
 
-        Points that are free to move along their surfaces hold the closed form back: its steps are lengthened and,
-        while they shrink, extrapolated by the last one (Anderson acceleration; Walker & Ni 2011, Pavlov et al.
-        2018). The closed form has no place for the prediction, which counts afterwards, where surfaces say little.
+        The closed form converges slowly where points slide along surfaces: its steps are over-relaxed and, while
+        they shrink, extrapolated with the last one (Anderson acceleration; Walker & Ni 2011, Pavlov et al. 2018).
+        It cannot include the prediction, which is applied afterwards along weakly constrained directions.
         """
         points, T_first = checked(points, target, T_first)
         settings, predicted = settings_of(self.config, target, wide=wide), expected(prior, T_first)
         problem = icp.problem_of(target.voxels, points, T_first, np.zeros_like(predicted.covariance), settings)
         source, closest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
-        lengths = lie.by_component(len(predicted.widest), 1.0, problem.range_m)  # that a twist moves a point by
+        lengths = lie.by_component(len(predicted.widest), 1.0, problem.range_m)  # that a unit twist moves a point
         limits = _LEFT * lie.by_component(len(lengths), settings.tolerance_m, settings.tolerance_rad) * lengths
         last = moved = np.zeros(len(lengths))
         T, scale_m, iterations, ending = T_first.copy(), settings.first_scale_m, 0, icp.OUT_OF_ITERATIONS

@@ -1,4 +1,4 @@
-"""The local map: voxels that remember mean, normal and shape, and forget what is far or old; and its upkeep."""
+"""The local map: voxels with mean, normal and shape, of which far and old ones are removed; and its upkeep."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from scanchain.data import AnyPoints, Points, Pose
 from scanchain.kernels.voxels import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
-_MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # from which on a voxel is fitted without its neighbors
-_NOISE_VOXELS = {2: 2.5, 3: 3.0}  # least size of a voxel in standard deviations of a range, to show a surface
-_ALONE = 120.0  # variances of a plane across it, over those of a voxel that shows it: 12 of the extent, 10 times
-_LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least number of voxels that there is room for
-_SWEEP_EVERY = 20  # insertions between two rounds of forgetting
-_RECENT = 20  # number of last scans from which a map with other voxels is built
-_SAME_NOISE = 0.1  # share of a standard deviation up to which two are one
-_ENOUGH = 10  # number of scans inserted of a lidar that stands
+_MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # number at which a voxel is fitted without its neighbors
+_NOISE_VOXELS = {2: 2.5, 3: 3.0}  # least voxel size, in standard deviations of a range, to resolve a surface
+_ALONE = 120.0  # ratio of a voxel's squared size to the noise variance in a plane: 12 (uniform) times 10
+_LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least capacity in voxels
+_SWEEP_EVERY = 20  # insertions between two removals of far and old voxels
+_RECENT = 20  # number of last scans from which the map is rebuilt with other voxels
+_SAME_NOISE = 0.1  # largest relative difference of two standard deviations that count as equal
+_ENOUGH = 10  # largest number of scans inserted at a standstill
 
 
 class VoxelMap:
-    """A map that points are inserted into and scans are matched against; grows and forgets by itself.
+    """A voxel map to insert points into and match scans against; it grows, and removes far and old voxels.
 
-    A map without a limit of the distance forgets nothing.
+    Without a limit of the distance, nothing is removed.
 
-    ``voxels`` holds the arrays for the kernels; nobody else writes into them.
+    ``voxels`` holds the arrays for the kernels; no other code may write to them.
     """
 
     def __init__(self, dimension: int, config: LocalMapConfig, scale: float = 1.0, noise_m: float = 0.0) -> None:
-        """Make an empty map with voxels of ``scale`` times ``local_map.voxel_size_m``, or larger ones.
+        """Empty map with voxels of ``scale`` times ``local_map.voxel_size_m``, or larger ones for noisy ranges.
 
-        noise_m : standard deviation of the ranges where it counts, else 0; voxels that it fills have no shape
+        noise_m : standard deviation of the ranges where it matters, else 0; voxels filled by noise have no shape
         """
         checks.instance(config, LocalMapConfig, "config", "load_settings(dimension).config.local_map")
         self.dimension = checks.dimension(dimension)
@@ -44,13 +44,13 @@ class VoxelMap:
         self.insertions = 0
         self.voxels = _empty(_LEAST, self.scale * config.voxel_size_m)
         noisy = 2.0 * (_ALONE * (noise_m / self.voxels.size_m) ** 2) ** 2
-        self.alone = max(_MIN_POINTS_ALONE[dimension], noisy)  # points that show a plane in spite of the noise
+        self.alone = max(_MIN_POINTS_ALONE[dimension], noisy)  # points needed to resolve a plane despite the noise
 
     def __len__(self) -> int:
         return int(self.voxels.used[0])
 
     def insert(self, points: AnyPoints, T_map_lidar: Pose) -> None:
-        """Add points (N, d) of the lidar frame; every so often forget what is far or old.
+        """Insert points (N, d), lidar frame; every _SWEEP_EVERY insertions far and old voxels are removed.
 
         Raises InputError where points or pose do not fit the map.
         """
@@ -70,7 +70,7 @@ class VoxelMap:
         return self.voxels.cells[: len(self), : self.dimension].copy()
 
     def compact(self) -> None:
-        """Free the memory that is there for further points."""
+        """Free the memory reserved for further points."""
         kept = _empty(len(self), self.voxels.size_m, _LEAST_COMPACT)
         if len(kept.cells) < len(self.voxels.cells):
             keep(self.voxels, kept, 0.0, 0.0, 0.0, np.inf, 0)
@@ -85,7 +85,7 @@ class VoxelMap:
 
 
 class MapKeeper:
-    """The voxel map ``surfaces``, and the last scans in it, from which it can be rebuilt."""
+    """The voxel map ``surfaces`` and its last scans, from which it can be rebuilt."""
 
     def __init__(self, dimension: int, config: LocalMapConfig) -> None:
         self.config = config
@@ -97,8 +97,8 @@ class MapKeeper:
     def extend(self, points: Points, T_odom_lidar: Pose, *, is_standing: bool = False) -> None:
         """Insert a scan (N, d) that moved far enough from the last one inserted.
 
-        Of a lidar that stands only the first few, whose mean is less noisy than one of them: more would bring
-        nothing new but what moves past it.
+        At a standstill only the first few are inserted, whose mean is less noisy than a single scan: more would
+        add nothing but moving objects.
         """
         self.standing_scans = self.standing_scans + 1 if is_standing else 0
         distance_m, angle_rad = lie.apart(self.T_odom_inserted, T_odom_lidar)
@@ -107,20 +107,20 @@ class MapKeeper:
             self.insert(points, T_odom_lidar)
 
     def insert(self, points: Points, T_odom_lidar: Pose) -> None:
-        """Insert a scan (N, d) wherever it is."""
+        """Insert a scan (N, d), however far it has moved."""
         self.surfaces.insert(points, T_odom_lidar)
         self.recent.append((points, T_odom_lidar))
         self.T_odom_inserted = T_odom_lidar
 
     def resize(self, scale: float, noise_m: float = 0.0) -> None:
-        """Rebuild the map from the last scans where the scale of its voxels changes, or the noise of ranges."""
+        """Rebuild the map from the last scans if the scale of its voxels or the range noise changes."""
         is_known = abs(noise_m - self.surfaces.noise_m) <= _SAME_NOISE * noise_m
         if scale != self.scale or not is_known:
             self.scale = scale
             self._remake(noise_m)
 
     def replace(self, scans: Iterable[tuple[Points, Pose]]) -> None:
-        """Rebuild the map from these scans (N, d), each in its own lidar frame, with its pose; none empty it."""
+        """Rebuild the map from these scans (N, d), each in its lidar frame and with its pose; none empty it."""
         self.recent.clear()
         self.recent.extend(scans)
         self._remake(self.surfaces.noise_m)

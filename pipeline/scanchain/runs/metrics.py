@@ -75,8 +75,8 @@ class Metrics(Struct, frozen=True):
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
     ``expected_ate_m`` is the ATE as far as it is known without the truth; null where the graph has no edge or its
     edges leave poses free.
-    ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``verdict_error`` the error that
-    it vouches for, ``stretches`` are what to look at.
+    ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``verdict_error`` the error
+    estimate, ``stretches`` are what to look at.
     ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
     ``calibrated_from`` on; 0 where no error was found; ``elevation_sigma_rad`` its standard deviation, null where
     none was estimated.
@@ -154,7 +154,7 @@ class Metrics(Struct, frozen=True):
 
     @property
     def judged(self) -> Judged:
-        """Verdict, the error that it vouches for, reason and stretches."""
+        """Verdict, error estimate, reason and stretches to check."""
         return Judged(self.verdict, self.verdict_reason, self.stretches, self.verdict_error)
 
     @property

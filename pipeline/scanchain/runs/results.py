@@ -48,7 +48,7 @@ from scanchain.trajectory import write_kitti, write_tum
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
 _MOST_SCANS = 20_000  # evenly spread over the log, whose errors are expected
-_TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground from which on it is said
+_TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground above which it is reported
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,1 +1,1 @@
-"""Maps that live on: localization in a map, merging of maps, and what changed between them."""
+"""Reusing maps: localization in a map, merging of maps, and changes between maps."""

@@ -1,4 +1,4 @@
-"""A map placed in another one: its keyframes pass through the chain as a log's scans do in ``localize``."""
+"""Alignment of a map to another: its keyframes pass through the SLAM chain like scans of a log in ``localize``."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from scanchain.odometry.front_end import Located
 from scanchain.odometry.odometry import Tracked, first_match
 from scanchain.slam import Slam
 
-_LATE = 10  # number of keyframes before the first one that was matched, from which on these are matched, too
+_LATE = 10  # least number of keyframes before the first matched one for which these are matched backward, too
 _FOUND = 0.5, 0.05  # m and rad, standard deviations of the pose that they start from
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Keyframes placed among those of a map, which stay as they are.
+    """Keyframes localized among those of a map, which stay fixed.
 
-    poses : (K, d+1, d+1) T_target_lidar of the keyframes, without meaning where not ``is_found``
+    poses : (K, d+1, d+1) T_target_lidar of the keyframes, meaningless where not ``is_found``
     closures : tried with the map; ``source`` is the number of the map's keyframes plus that of the keyframe
     loops : number of them in force
-    is_found : whether they join all keyframes to the map, by the evidence that ``localize`` asks for
+    is_found : whether they join all keyframes to the map, with the evidence that ``localize`` requires
     """
 
     poses: Matrix
@@ -58,7 +58,7 @@ class Alignment:
 
 
 def opened_maps(runs: Sequence[Path], out: Path) -> list[SavedMap]:
-    """The maps of run directories, or in folders, of one kind; none of them is the directory to be written.
+    """The maps of run directories or map folders, of one dimension; none of them is the output directory.
 
     Raises InputError for a map that cannot be read, or has no keyframe.
     """
@@ -77,15 +77,15 @@ def opened_maps(runs: Sequence[Path], out: Path) -> list[SavedMap]:
 
 
 def align_maps(target: SavedMap, source: SavedMap, config: Config) -> Alignment:
-    """The keyframes of ``source`` in the frame of ``target``, wherever they are in it.
+    """The keyframes of ``source`` in the frame of ``target``, without an initial guess.
 
     Raises InputError where the source is not found in the target.
     """
     found = align(target, source.keyframes, source.edges, config, is_final=True)
     if not found.is_found:
         raise InputError(
-            f"{source.name}: is not found in {target.name} ({counted(len(found.closures), 'place')} tried, "
-            f"{len(found.accepted)} fit); give maps of one place, or the transform between them"
+            f"{source.name}: is not found in {target.name} ({counted(len(found.closures), 'closure')} tried, "
+            f"{len(found.accepted)} accepted); give maps of one place, or the transform between them"
         )
     return found
 
@@ -93,15 +93,15 @@ def align_maps(target: SavedMap, source: SavedMap, config: Config) -> Alignment:
 def align(
     target: SavedMap, keyframes: Sequence[Keyframe], edges: Edges, config: Config, *, is_final: bool
 ) -> Alignment:
-    """Keyframes with the edges between them, placed in the target along their path.
+    """Keyframes with the edges between them, localized in the target along their path.
 
-    From where the path is found late it is followed back to its begin, too.
+    If the path is found late, it is also tracked backward from there to its start.
 
-    is_final : whether the target's keyframes lie as well as they ever will
+    is_final : whether the poses of the target's keyframes are final
     """
     path_m = keyframes[-1].traveled_m - keyframes[0].traveled_m
     loops = msgspec.structs.replace(config.loops, min_travel_m=max(path_m, config.loops.min_travel_m) + 1.0)
-    between = msgspec.structs.replace(config, loops=loops)  # no loop is as short as to lie within the path
+    between = msgspec.structs.replace(config, loops=loops)  # so that no loop lies within the path
     walked = partial(_walked, target, keyframes, edges, config=between, is_final=is_final)
     old = len(target.keyframes)
     found = walked(range(len(keyframes)))
@@ -123,9 +123,9 @@ def _walked(
     is_final: bool,
     T_target_first: Pose | None = None,
 ) -> Alignment:
-    """Keyframes, in this order of some of their numbers, placed in the target one after the other.
+    """Some keyframes, localized in the target one after the other in the given ``order``.
 
-    config, is_final : as of ``align``, but that no loop is closed within the path
+    config, is_final : as of ``align``, except that no loop is closed within the path
     T_target_first : pose of the first of them, where it is known
     """
     slam = Slam(config, dimension=target.dimension, prior=target, prior_is_final=is_final)
@@ -163,7 +163,7 @@ def _information(keyframes: Sequence[Keyframe], edges: Edges, order: Sequence[in
 
 
 def _located(keyframe: Keyframe, information: Matrix, first_points: Points, config: Config) -> Located:
-    """A keyframe of a map as odometry would hand it on, its final pose for that of odometry."""
+    """A keyframe of a map as odometry would output it, with its final pose in place of that of odometry."""
     points, T = keyframe.points, keyframe.T_odom_lidar
     raw: RawPoints = points.astype(np.float32)
     scan = Scan(keyframe.scan_index, keyframe.stamp_ns, keyframe.stamp_ns, raw, np.empty(0, np.float32), 0, None)

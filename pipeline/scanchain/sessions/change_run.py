@@ -1,4 +1,4 @@
-"""``scanchain changes``: two maps, or the sessions of one, aligned and compared; the files of what changed."""
+"""``scanchain changes``: aligns and compares two maps, or the sessions of one, and writes the changes to files."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def compare_maps(
 ) -> Changes:
     """The changes, written into the directory ``out``.
 
-    runs : directories of the earlier and the later map, or one, whose newest session is compared with all before
+    runs : directories of the earlier and the later map, or of one, whose newest session is compared with the rest
     present : adds report and recording to a directory; say : called with each stage when it begins
     T_earlier_later : (d+1, d+1) where it is known; None to find it
     voxel_size_m, min_size_m : as in ``changes_between``; command : the command line, for run.json
@@ -73,7 +73,7 @@ def compare_maps(
 
 
 def _sessions(merged: SavedMap) -> tuple[Part, Part]:
-    """All sessions but the newest, and that one."""
+    """The older sessions together, and the newest session."""
     if len(merged.sessions) < 2:
         raise InputError(f"{merged.folder}: has one session; give a second map to compare with")
     *before, newest = (session.name for session in merged.sessions)
@@ -88,7 +88,7 @@ def _sessions(merged: SavedMap) -> tuple[Part, Part]:
 def _in_one_frame(
     runs: Sequence[Path], maps: Sequence[SavedMap], T: Pose | None, config: Config, say: Callable[[str], None]
 ) -> tuple[Part, Part, str]:
-    """Both maps in the frame of the first, and how the second came into it, in words."""
+    """Both maps in the frame of the first, and a description of how the second was aligned to it."""
     first, second = maps
     names = (first.name, second.name) if first.name != second.name else (str(runs[0]), str(runs[1]))
     if T is None:
@@ -105,7 +105,7 @@ def _in_one_frame(
 def _write(folder: Path, changes: Changes, alignment: str) -> None:
     """Write changes.ply, changes.csv and .parquet, summary.txt and metrics.json.
 
-    alignment : how the later map came into the frame of the earlier one, in words
+    alignment : description of how the later map was aligned to the earlier one
     """
     colors = np.array([COLORS[label] for label in Label], np.uint8)[changes.labels]
     columns = dict(zip(("red", "green", "blue"), colors.T, strict=True))
@@ -158,7 +158,7 @@ def _summary(changes: Changes, alignment: str, counts: dict[Label, int]) -> str:
         f"earlier        {changes.names[0]}",
         f"later          {changes.names[1]}",
         f"alignment      {alignment}",
-        f"agreement      {100.0 * changes.agreement:.1f} % of what both had in sight is the same",
+        f"agreement      {100.0 * changes.agreement:.1f} % of what both observed is the same",
         f"resolution     voxels of {changes.voxel_size_m:g} m, scans compared up to {changes.reach_m:.0f} m",
         "points         " + ", ".join(f"{count:,} {label.name.lower()}" for label, count in counts.items()),
     ]
@@ -172,7 +172,7 @@ def _summary(changes: Changes, alignment: str, counts: dict[Label, int]) -> str:
 
 
 def _described(cluster: Cluster, changes: Changes) -> str:
-    """A cluster in words: number, place, size, and where it came from or went."""
+    """Description of a cluster: number, position, size, and where it moved to or from."""
     place = ", ".join(f"{x:.1f}" for x in cluster.center)
     size = " x ".join(f"{x:.2f}" for x in cluster.size_m)
     text = f"{cluster.number:3d}  at ({place}) m, {size} m, {counted(cluster.points, 'point')}"

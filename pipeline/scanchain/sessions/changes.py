@@ -22,15 +22,15 @@ from scanchain.runs.results import cloud_of, views_of
 
 _SAME_VOXELS = 1.5  # distance, in voxels, within which the other map has the same surface
 _JOINED_VOXELS = {2: 4.0, 3: 3.0}  # distance within which changed points belong to one cluster
-_LEAST_POINTS = {2: 3, 3: 6}  # of a cluster
+_LEAST_POINTS = {2: 3, 3: 6}  # least number of points of a cluster
 _LEG_M, _LEGS_M = 0.2, 1.0  # size of legs of furniture, and distance within which they belong to one piece
-_LEAST_AGREEMENT = 0.4  # least share of same points among those that both maps had in sight
+_LEAST_AGREEMENT = 0.4  # least share of unchanged points among those that both maps observed
 _ANGLES = 90  # headings that a box around a cluster is tried at, over 90°
-_ALIKE_SHARE, _ALIKE_VOXELS = 0.1, 1.0  # by which lengths of one object may differ that was seen from two sides
-_MOVED_SIZES = 5.0  # farthest that an object is known again by its size alone, in lengths of it
-_UNRIVALED = 0.33  # share of the distance of any other cluster as large, below which it is known again
+_ALIKE_SHARE, _ALIKE_VOXELS = 0.1, 1.0  # by which lengths of one object may differ between two views
+_MOVED_SIZES = 5.0  # largest distance at which an object is recognized by its size alone, in lengths of it
+_UNRIVALED = 0.33  # largest ratio of that distance to that of any other cluster of the same size
 _THIN_VOXELS = 1.25  # thickness of a cluster, in voxels, below which it can be a surface that rays grazed
-_BESIDE_VOXELS = 4.0  # distance of such a cluster's points to that surface, in voxels
+_ADJACENT_VOXELS = 4.0  # largest distance of such a cluster's points from that surface, in voxels
 
 
 class Label(IntEnum):
@@ -47,9 +47,9 @@ Kind = Literal["appeared", "vanished"]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A map, or a session of one, as it takes part in a comparison.
+    """A map, or sessions of one, to compare.
 
-    name : of it
+    name : for messages and results
     keyframes, poses : (K, d+1, d+1) T_common_lidar of the keyframes
     """
 
@@ -62,12 +62,12 @@ class Part:
 class Cluster:
     """Points close to each other that all appeared or all vanished.
 
-    kind, number : of it; numbers count through both kinds, from 1, the largest first
+    kind, number : clusters of both kinds are numbered together, from 1, the largest first
     center : (d,) middle of its box, meters, frame of the earlier map
     size_m : (d,) of the box: the longer and the shorter side on the ground, the height
     yaw_rad : direction of the longer side
-    points : number of its points, one a voxel
-    counterpart : number of the cluster that this object left or became when it moved, 0 if it did not
+    points : number of its points, one per voxel
+    counterpart : number of the cluster at the other position of an object that moved, 0 for one that did not
     """
 
     kind: Kind
@@ -80,7 +80,7 @@ class Cluster:
 
     @property
     def volume(self) -> float:
-        """Of the box: m³, in the plane m²."""
+        """Volume of the box in m³; in 2D its area in m²."""
         return float(np.prod(self.size_m))
 
 
@@ -89,11 +89,11 @@ class Changes:
     """The difference of two maps.
 
     names : of the earlier and the later map
-    points : (N, d) of both, one a voxel; of what is the same those of the earlier map
+    points : (N, d) of both maps, one per voxel; unchanged ones are of the earlier map
     labels : (N,) uint8 values of ``Label``
     of_cluster : (N,) number of each point's cluster, 0 for none
     clusters : in the order of their numbers
-    agreement : share of same points among those that both maps had in sight
+    agreement : share of unchanged points among those that both maps observed
     voxel_size_m : edge of the voxels
     """
 
@@ -122,13 +122,13 @@ def changes_between(
 ) -> Changes:
     """The changes from one map to the other, both in one frame.
 
-    A point vanished if the later map clearly saw through where it was, and appeared if the earlier one saw through
-    where it came to be; where the other did not look, its fate is unknown. What moved while a map was made is left
-    out of it.
+    A point vanished if the later map clearly saw through its position, and appeared if the earlier one did; if the
+    other map did not observe the position, the change is unknown. What moved while a map was recorded is removed
+    beforehand.
 
-    voxel_size_m : of the comparison; ``maps.voxel_size_m`` where left out
-    min_size_m : least length of a cluster, below which its points are unknown
-    Raises InputError where the maps do not fit on each other.
+    voxel_size_m : of the comparison; ``maps.voxel_size_m`` by default
+    min_size_m : least length of a cluster; the points of smaller ones are unknown
+    Raises InputError if the maps do not match.
     """
     size_m = config.maps.voxel_size_m if voxel_size_m is None else voxel_size_m
     maps = structs.replace(config.maps, voxel_size_m=size_m, remove_moving=True)
@@ -140,8 +140,8 @@ def changes_between(
     agreement = float(counts[Label.SAME] / max(counts.sum() - counts[Label.UNKNOWN], 1))
     if agreement < _LEAST_AGREEMENT:
         raise InputError(
-            f"{later.name}: only {100.0 * agreement:.0f} % of what both maps had in sight is the same as in "
-            f"{earlier.name}, they are not in one frame; give another --transform or none, and maps of one place"
+            f"{later.name}: only {100.0 * agreement:.0f} % of what both maps observed is the same as in "
+            f"{earlier.name}: not in one frame; give another --transform or none, and maps of one place"
         )
     is_new = labels_after != Label.SAME
     points, labels = np.vstack([before, after[is_new]]), np.append(labels_before, labels_after[is_new])
@@ -183,9 +183,9 @@ def _clusters(
 
 
 def _is_grazed(points: Points, rest: KDTree, size_m: float) -> bool:
-    """True for points in space, level or in one line, most of which continue in points that did not change.
+    """True for 3D points on a level plane or a line, most of which are next to unchanged points along it.
 
-    Rays that graze the ground, an edge or a pole pass beside points of it.
+    Rays that graze the ground, an edge or a pole pass close to its points.
     """
     if points.shape[1] == 2:
         return False
@@ -195,10 +195,10 @@ def _is_grazed(points: Points, rest: KDTree, size_m: float) -> bool:
         return False
     others = np.asarray(rest.data)
     continued = 0
-    for point, found in zip(points, rest.query_ball_point(points, _BESIDE_VOXELS * size_m), strict=True):
+    for point, found in zip(points, rest.query_ball_point(points, _ADJACENT_VOXELS * size_m), strict=True):
         away = others[found] - point
-        is_beside = (np.abs(away @ across.T) < size_m).all(axis=1) & (away[:, 2] > -size_m)
-        continued += bool(is_beside.any())
+        is_adjacent = (np.abs(away @ across.T) < size_m).all(axis=1) & (away[:, 2] > -size_m)
+        continued += bool(is_adjacent.any())
     return continued > 0.5 * len(points)
 
 
@@ -225,7 +225,7 @@ def _connected(points: Points, chosen: NDArray[np.int64], reach_m: float) -> lis
 
 
 def _box(points: Points, size_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Center (d,), size (d,) and heading of the upright box of least area around points, a voxel larger."""
+    """Center (d,), size (d,) and heading of the upright box of least area around points, enlarged by a voxel."""
     yaws = np.arange(_ANGLES) * (0.5 * np.pi / _ANGLES)
     axes = np.stack([np.cos(yaws), np.sin(yaws), -np.sin(yaws), np.cos(yaws)], axis=-1).reshape(-1, 2, 2)
     turned = axes @ points[:, :2].T
@@ -243,10 +243,10 @@ def _box(points: Points, size_m: float) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def _paired(clusters: Sequence[Cluster], size_m: float) -> tuple[Cluster, ...]:
-    """With the counterparts of what moved: the nearest that is as large, all others being much farther away."""
+    """The clusters with counterparts: the nearest one of the same size, if all others are much farther away."""
     gone = [cluster for cluster in clusters if cluster.kind == "vanished"]
     come = [cluster for cluster in clusters if cluster.kind == "appeared"]
-    if not gone or not come or len(gone[0].center) == 2:  # outlines of furniture are too alike
+    if not gone or not come or len(gone[0].center) == 2:  # outlines of furniture are too similar
         return tuple(clusters)
     away_m = np.array([[np.linalg.norm(a.center - b.center) for b in come] for a in gone])
     away_m[[[not _alike(a, b, size_m) for b in come] for a in gone]] = np.inf
@@ -261,6 +261,6 @@ def _paired(clusters: Sequence[Cluster], size_m: float) -> tuple[Cluster, ...]:
 
 
 def _alike(a: Cluster, b: Cluster, size_m: float) -> bool:
-    """True if the boxes can be those of one object, seen from two sides."""
+    """True if the boxes can be two views of the same object."""
     longer = np.maximum(a.size_m, b.size_m)
     return bool((np.abs(a.size_m - b.size_m) < _ALIKE_SHARE * longer + _ALIKE_VOXELS * size_m).all())

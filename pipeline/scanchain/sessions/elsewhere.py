@@ -1,4 +1,4 @@
-"""Maps from elsewhere: point clouds and occupancy grids as maps to localize in, as a lidar would see them."""
+"""Import of point clouds and occupancy grids as maps to localize in, by simulating what a lidar would see."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from scanchain.runs.provenance import describe_start
 from scanchain.settings import load_settings
 
 LAS_SUFFIXES, GRID_SUFFIXES = (".laz", ".las"), (".yaml", ".yml")
-SPACING_M = {2: 1.5, 3: 6.0}  # between the positions that a map is seen from
-VIEW_M = {2: 30.0, 3: 50.0}  # how far it is seen
+SPACING_M = {2: 1.5, 3: 6.0}  # between the positions of virtual scans
+VIEW_M = {2: 30.0, 3: 50.0}  # range of virtual scans
 _HEIGHT_M = 1.6  # of a lidar above the ground
 _CLEARANCE_M = 0.4  # least distance of a position from any point
-_GROUND_RADIUS_M, _GROUND_PERCENTILE = 2.0, 5.0  # around a position, and which of the heights there is the ground
-_BINS = {2: (1, 720), 3: (180, 360)}  # of elevation and azimuth, in which nearer points hide others
-_HIDDEN_M = 0.5  # farther than the nearest point of its bin, from which on a point is hidden
-_SECTORS, _LEAST_SECTORS = 36, 0.6  # of azimuth, and share of them with points that a position in the plane needs
-_LEAST_POINTS = 100  # in view
+_GROUND_RADIUS_M, _GROUND_PERCENTILE = 2.0, 5.0  # radius; percentile of heights in it that is the ground
+_BINS = {2: (1, 720), 3: (180, 360)}  # of elevation and azimuth, in which nearer points occlude others
+_HIDDEN_M = 0.5  # distance behind the nearest point of its bin beyond which a point is occluded
+_SECTORS, _LEAST_SECTORS = 36, 0.6  # of azimuth, and least share of them with points at a position in 2D
+_LEAST_POINTS = 100  # least number of points in view of a position
 _FLAT_M = 1e-6  # extent in height of points in the plane
-_MAX_POSITIONS, _MAX_CELLS = 20_000, 2_000_000  # of positions, and of those that are tried
+_MAX_POSITIONS, _MAX_CELLS = 20_000, 2_000_000  # largest numbers of positions, and of those that are tried
 _LEAST_CELL_M, _LARGEST_CELL_M = 1e-3, 1e2  # of a grid
-_PERCENTILE, _OUTLIER = 99.0, 10.0  # of distances from the middle; times that, beyond which points are outliers
-_COARSE_STEP_M = 0.01  # of coordinates, above which their rounding adds to a sensor's noise of 3 cm
+_PERCENTILE, _OUTLIER = 99.0, 10.0  # of distances from the median; multiple of it beyond which points are outliers
+_COARSE_STEP_M = 0.01  # of coordinates, above which rounding adds to a sensor noise of 3 cm
 _MODES = ("trinary", "scale", "raw")  # of map_server
 
 
@@ -62,7 +62,7 @@ class Imported:
 
 @dataclass(frozen=True, slots=True)
 class _Surfaces:
-    """Points (N, d) of a map, positions (P, d) that are free, where the file tells, notes as of ``Imported``."""
+    """Points (N, d) of a map, free positions (P, d) if the file contains them, and notes as of ``Imported``."""
 
     points: Points
     free: Points | None = None
@@ -83,7 +83,7 @@ def import_map(
 
     spacing_m : between the virtual keyframes; SPACING_M where left out
     height_m : of the lidar above the ground, in space; command : the command line, for run.json
-    Raises InputError for a file that cannot be read, or in which no lidar could have been anywhere.
+    Raises InputError for a file that cannot be read, or has no position from which a lidar sees enough.
     """
     say(f"reading {file.name}")
     surfaces = _read(file, spacing_m)
@@ -96,7 +96,7 @@ def import_map(
         keyframes = tuple(_keyframes(surfaces.points, positions, config))
         if not keyframes:
             raise InputError(
-                f"{file}: a lidar {height_m:g} m above the ground sees {_LEAST_POINTS} points nowhere; give a "
+                f"{file}: nowhere does a lidar {height_m:g} m above the ground see {_LEAST_POINTS} points; give a "
                 "cloud in meters with z up, or another --height"
             )
         count, d, k = len(keyframes), dimension + 1, 3 * (dimension - 1)
@@ -138,7 +138,7 @@ def _read(file: Path, spacing_m: float | None) -> _Surfaces:
     if len(points) < count:
         notes.append(
             f"{file}: {counted(count - len(points), 'point')} of {count:,} are left out: coordinates that are not "
-            f"finite, or more than {_OUTLIER:g} times as far off as {_PERCENTILE:g} % of the points"
+            f"finite, or more than {_OUTLIER:g} times as far out as {_PERCENTILE:g} % of the points"
         )
     step_m = max(map(_step_m, columns, points.T), default=0.0)
     if step_m > _COARSE_STEP_M:
@@ -151,7 +151,7 @@ def _read(file: Path, spacing_m: float | None) -> _Surfaces:
 
 
 def _without_outliers(points: Points, spacing_m: float) -> Points:
-    """Points (N, 3) without a few far off, where the others alone can be seen from positions so far apart."""
+    """Points (N, 3); without outliers if the extent is too large for positions at this spacing."""
     if np.ptp(points[:, :2], axis=0).max() < math.sqrt(_MAX_CELLS) * spacing_m:
         return points
     away_m = np.abs(points - np.median(points, axis=0)).max(axis=1)
@@ -159,7 +159,7 @@ def _without_outliers(points: Points, spacing_m: float) -> Points:
 
 
 def _step_m(column: NDArray[Any], values: NDArray[np.float64]) -> float:
-    """Largest step between neighboring numbers of a column, as it was stored, at its values (N,) that are used."""
+    """Largest rounding step of a column, in the precision it was stored with, at the values (N,) that are used."""
     if column.dtype.kind != "f":
         return 1.0
     with np.errstate(over="ignore"):
@@ -169,10 +169,10 @@ def _step_m(column: NDArray[Any], values: NDArray[np.float64]) -> float:
 
 
 def _read_grid(file: Path) -> _Surfaces:
-    """Occupied and free cells of a map of map_server, at their centers; modes and thresholds as nav2 reads them.
+    """Centers of occupied and free cells of a map for map_server; modes and thresholds as nav2 reads them.
 
-    Of trinary and scale, cells that are not opaque are unknown; of raw, a pixel is the occupancy in percent, above
-    100 unknown, and ``negate`` does not count.
+    In modes trinary and scale, cells that are not opaque are unknown; in raw, a pixel is the occupancy in percent,
+    unknown above 100, and ``negate`` is ignored.
     """
     from PIL import Image
     from ruamel.yaml import YAML
@@ -222,7 +222,7 @@ def _read_grid(file: Path) -> _Surfaces:
 
 
 def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points:
-    """Positions (P, d) on a grid, where a lidar could be, there and back along its rows: each beside the next."""
+    """Positions (P, d) on a grid where a lidar could be; rows alternate in direction, so that neighbors follow."""
     points = surfaces.points
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     if np.prod((high - low) / spacing_m + 1.0) > _MAX_CELLS:
@@ -238,7 +238,7 @@ def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points
         grid = grid[KDTree(surfaces.free).query(grid)[0] < 0.5 * _CLEARANCE_M]
     clear = KDTree(points).query(grid)[0] > _CLEARANCE_M if len(grid) else np.zeros(0, bool)
     if clear.sum() > _MAX_POSITIONS:
-        raise InputError(f"the map would be seen from {int(clear.sum()):,} positions; give a larger --spacing")
+        raise InputError(f"the map needs {int(clear.sum()):,} virtual scans; give a larger --spacing")
     positions = grid[clear]
     row = np.floor(positions[:, 1] / spacing_m)
     along = np.where(row % 2 == 0, positions[:, 0], -positions[:, 0])
@@ -257,7 +257,7 @@ def _above_ground(points: Points, grid: Matrix, height_m: float) -> Points:
 
 
 def _keyframes(points: Points, positions: Points, config: Config) -> Iterator[Keyframe]:
-    """Virtual keyframes with the points in view of them, downsampled as scans are."""
+    """Virtual keyframes with the points in view of each, downsampled like scans."""
     dimension = points.shape[1]
     tree, resolution = KDTree(points), Resolution(config.preprocess, config.local_map.voxel_size_m)
     index, traveled_m, last = 0, 0.0, None
@@ -275,7 +275,7 @@ def _keyframes(points: Points, positions: Points, config: Config) -> Iterator[Ke
 
 
 def _in_view(points: Points) -> Points:
-    """Points (M, d) around a lidar that no nearer ones hide."""
+    """Points (M, d) around a lidar that nearer ones do not occlude."""
     rows, columns = _BINS[points.shape[1]]
     ranges_m = np.empty((rows, columns))
     in_space = lie.lift_points(points)
@@ -289,6 +289,6 @@ def _in_view(points: Points) -> Points:
 
 
 def _is_inside(seen: Points) -> bool:
-    """True if points of the plane are on most sides."""
+    """True if 2D points surround the lidar on most sides."""
     sectors = np.floor((np.arctan2(seen[:, 1], seen[:, 0]) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int)
     return len(np.unique(np.minimum(sectors, _SECTORS - 1))) >= _LEAST_SECTORS * _SECTORS

@@ -1,4 +1,4 @@
-"""Maps in one frame: each is placed in those that are joined already, then all edges are optimized together."""
+"""Joining of maps in one frame: each is localized in those already joined, then all edges are optimized."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from scanchain.maps import Edges, SavedMap
 from scanchain.placement import loop_information
 from scanchain.sessions.alignment import align
 
-_APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both
-_CLEAR = 0.1  # share of a map's keyframes with a closure in force from which on no other is tried before it joins
-_NEW_M = 5.0  # distance from older keyframes, at full scale, of those in a new area
-_NEW_KEYFRAMES = 3  # number of them, from which on maps that were not found are sought again
+_APART_M = 200.0  # path assumed between the last keyframe of a map and the first of the next: no submap has both
+_CLEAR = 0.1  # share of a map's keyframes with a closure in force above which it joins before others are tried
+_NEW_M = 5.0  # distance from older keyframes, at full scale, beyond which a keyframe is in a new area
+_NEW_KEYFRAMES = 3  # least number of them for which maps that were not found are searched for again
 _IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
-_MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # share of them from which on it is told, and times that within the maps
+_MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # least share of contradictions reported, and ratio to that within maps
 _WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
-_PATH_M, _STEP_M = 8.0, 2.0  # length of paths whose points are sought together, in the plane, and between two
+_PATH_M, _STEP_M = 8.0, 2.0  # length of paths in 2D that are searched for as a whole, and spacing
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
 _AGREEING = 0.3  # least share of the keyframes of an agreeing path that agree
-_MAX_PATHS = 200  # largest number of these; along longer sessions they lie farther apart
-_SOUGHT = 8  # largest number of paths that are sought elsewhere
-MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
-_MIN_PATHS, _MIN_KEYFRAMES = 2, 5  # least numbers of agreeing paths, in the plane, and of keyframes
-_STORIES = 5.0  # log-odds that are asked for in space beyond the usual: stories are alike from end to end
+_MAX_PATHS = 200  # largest number of such paths; along longer sessions they lie farther apart
+_SEARCHED = 8  # largest number of paths that are searched for elsewhere
+MAX_REPEATED = 0.25  # largest share of the agreeing paths that may also fit other locations
+_MIN_PATHS, _MIN_KEYFRAMES = 2, 5  # least numbers of agreeing paths, and of keyframes
+_STORIES = 5.0  # log-odds required in 3D beyond the usual: stories of a building can be similar throughout
 _SHORT = "they agree along a short path only"
 
 
@@ -50,7 +50,7 @@ class Joined:
     maps : numbers of the maps, in the order in which they joined
     keyframes : of all of them in this order; ``T_odom_lidar`` is the pose in the common frame
     of_map : (K,) number of each keyframe's map
-    edges : of the maps, and the closures between them, with the weights that the optimizer left to them
+    edges : of the maps, and the closures between them, with their final robust weights
     closures : tried between maps, accepted by matching or not
     """
 
@@ -62,7 +62,7 @@ class Joined:
 
     @classmethod
     def of(cls, number: int, maps: Sequence[SavedMap]) -> Joined:
-        """One of several maps alone."""
+        """A single one of several maps."""
         saved = maps[number]
         return cls((number,), saved.keyframes, np.full(len(saved.keyframes), number), saved.edges)
 
@@ -89,7 +89,7 @@ class Joined:
 
 
 class Doubt(msgspec.Struct, frozen=True):
-    """A session that might lie in the frame of another one, but stays apart.
+    """A session that may belong to the frame of another one, but is not joined for lack of evidence.
 
     position_m, yaw_deg : of its first keyframe there
     reason : why it is not certain
@@ -103,7 +103,7 @@ class Doubt(msgspec.Struct, frozen=True):
 
     @property
     def text(self) -> str:
-        """The doubt as a clause."""
+        """The uncertain join as a clause."""
         position = ", ".join(f"{each:.1f}" for each in self.position_m)
         return (
             f"{self.session} might begin at ({position}) m, heading {self.yaw_deg:.0f} deg, in the frame of "
@@ -112,7 +112,7 @@ class Doubt(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, session: str, frame: str, T_frame_session: Pose, reason: str) -> Doubt:
-        """The doubt about a pose (d+1, d+1)."""
+        """The uncertain join of a session at a pose (d+1, d+1)."""
         T = T_frame_session
         position_m, yaw_deg = np.round(T[:-1, -1], 2), np.round(np.degrees(np.arctan2(T[1, 0], T[0, 0])), 1)
         return cls(session, frame, tuple(position_m.tolist()), float(yaw_deg), reason)
@@ -126,10 +126,10 @@ def join_all(
     held: int,
     say: Callable[[str], None],
 ) -> tuple[list[Joined], list[Doubt]]:
-    """Maps that belong together, each group in one frame, that of its first map; and what might belong to them.
+    """Groups of maps that belong together, each in the frame of its first map; and uncertain joins.
 
-    Of those that are found in a group the one that shares most of its path joins it. One that is not found is
-    sought again once the group has grown into an area that it had not reached.
+    Of the maps that are found in a group, the one with the largest overlap joins it. A map that is not found is
+    searched for again once the group has grown into a new area.
 
     order : numbers of the maps; names : of their first sessions
     held : number of a map whose keyframes stay where they are, −1 for none
@@ -139,22 +139,22 @@ def join_all(
     waiting = list(order)
     while waiting:
         world = Joined.of(waiting.pop(0), maps)
-        sought = dict.fromkeys(waiting, 0)  # keyframes of the world in which each was not found
+        searched = dict.fromkeys(waiting, 0)  # size of the world, in keyframes, when each was last not found in it
         joined: Joined | None = world
         while joined is not None:
             world, joined = joined, None
             old, trials = len(world.keyframes), dict[int, Joined]()
-            due = [number for number in waiting if _has_grown(world, sought[number])]
-            for number in sorted(due, key=lambda number: sought[number] > 0):
+            due = [number for number in waiting if _has_grown(world, searched[number])]
+            for number in sorted(due, key=lambda number: searched[number] > 0):
                 say(f"{maps[number].name}: searching in a map of {old:,} keyframes")
-                trial, sought[number] = join(world, Joined.of(number, maps), config, held), old
+                trial, searched[number] = join(world, Joined.of(number, maps), config, held), old
                 if trial is not None:
                     trials[number] = trial
                     if _overlap(trial, old) > _CLEAR:
                         break
             for number, trial in sorted(trials.items(), key=lambda each: -_overlap(each[1], old)):
                 if joined is not None:
-                    sought[number] = 0
+                    searched[number] = 0
                 elif reason := doubt_about(trial, old, config):
                     doubts[number] = Doubt.of(names[number], names[world.maps[0]], trial.poses[old], reason)
                 else:
@@ -166,16 +166,16 @@ def join_all(
 
 
 def _has_grown(world: Joined, before: int) -> bool:
-    """True if several keyframes of the world lie where none of its first ones did, or there were none."""
+    """True if several keyframes of the world are far from the first ``before`` ones, or there were none before."""
     positions, reach_m = world.poses[:, :-1, -1], _NEW_M * world.keyframes[0].scale
     away_m = KDTree(positions[:before]).query(positions[before:])[0]
     return bool((away_m > reach_m).sum() >= min(_NEW_KEYFRAMES, len(positions) - before) > 0)
 
 
 def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined | None:
-    """Both in the frame of the world, at the minimum of χ²; None where the guest is not found in it."""
+    """Both in the frame of the world, at the minimum of χ²; None if the guest is not found in it."""
     old = len(world.keyframes)
-    with TemporaryDirectory() as folder:  # for what a search makes of the world
+    with TemporaryDirectory() as folder:  # for what a search stores about the world
         target = SavedMap(Path(folder), world.dimension, world.keyframes, world.of_map, (), world.edges)
         found = align(target, guest.keyframes, guest.edges, config, is_final=False)
     accepted = found.accepted
@@ -205,9 +205,9 @@ def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined
 
 
 def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
-    """The pose graph of all edges; keyframes of the held map, its first one, are a single pose of the graph.
+    """The pose graph of all edges; the keyframes of the fixed map, the first one, are a single pose of the graph.
 
-    An edge to one of them is an edge to the first, with the pose between the two in its measurement.
+    An edge to one of them becomes an edge to the first, whose measurement includes the pose between the two.
     """
     poses, edges, body = joined.poses, joined.edges, _body(joined, held)
     node = np.maximum(np.arange(len(poses)) - body + 1, 0)
@@ -217,7 +217,7 @@ def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
     measurements[starts] = T_first_held[pairs[starts, 0]] @ measurements[starts]
     T_held_first = lie.inverse(T_first_held[pairs[ends, 1]])
     measurements[ends] = measurements[ends] @ T_held_first
-    to_own = lie.adjoint(T_held_first)  # a twist in the frame of the first as one in that of the other
+    to_own = lie.adjoint(T_held_first)  # from a twist in the frame of the first to one in that of the other
     information[ends] = np.swapaxes(to_own, 1, 2) @ information[ends] @ to_own
     kept = ~(starts & ends)
     graph = PoseGraph(joined.dimension)
@@ -228,7 +228,7 @@ def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
 
 
 def optimized(joined: Joined, config: Config, held: int = -1) -> Joined:
-    """All edges at the minimum of χ²; the keyframes of the held map stay where they are, or else the first one."""
+    """All edges at the minimum of χ²; fixed are the keyframes of the fixed map or else the first keyframe."""
     graph, body = graph_of(joined, held), _body(joined, held)
     graph.optimize(config.graph, initialize="given")
     weight = np.ones(len(joined.edges.pairs))
@@ -239,12 +239,12 @@ def optimized(joined: Joined, config: Config, held: int = -1) -> Joined:
 
 
 def _body(joined: Joined, held: int) -> int:
-    """Number of the first keyframes that are one pose of the graph."""
+    """Number of leading keyframes that are one pose of the graph."""
     return int((joined.of_map == held).sum()) or 1
 
 
 def changed(joined: Joined) -> dict[int, float]:
-    """Contradiction of maps with those they joined, by number, where it is far more than within them."""
+    """Share of contradicting points between each map, by number, and the others, if far above that within maps."""
     parts = {
         number: [joined.keyframes[k] for k in np.flatnonzero(joined.of_map == number)] for number in joined.maps
     }
@@ -263,7 +263,7 @@ def changed(joined: Joined) -> dict[int, float]:
 def doubt_about(joined: Joined, old: int, config: Config) -> str:
     """Reason why the keyframes from ``old`` on may belong elsewhere, empty if there is none.
 
-    The evidence is that of a log in a map, at the poses that fit all closures. What agrees is sought elsewhere.
+    The evidence is tested as for a log in a map, at optimized poses. What agrees is searched for elsewhere.
     """
     in_force, guest, segments = _joining(joined, old), joined.keyframes[old:], Segments()
     segments.start(old)
@@ -273,18 +273,18 @@ def doubt_about(joined: Joined, old: int, config: Config) -> str:
     asked = evidence.bound + (_STORIES if joined.dimension == 3 else 0.0)
     if evidence.log_odds < asked:
         agree = f"{counted(len(in_force), 'keyframe')} of it agree"
-        return f"{agree}, but all that was tried has log-odds of {evidence.log_odds:.1f}, of at least {asked:.1f}"
+        return f"{agree}, but all closures tried give log-odds of {evidence.log_odds:.1f}, below {asked:.1f}"
     if len(in_force) < _MIN_KEYFRAMES:
         return _SHORT
     if joined.dimension == 2:
         repeated, paths = repeated_paths(joined.keyframes[:old], guest, in_force - old, config)
     else:
-        some = in_force[:: -(-len(in_force) // _SOUGHT)].tolist()
+        some = in_force[:: -(-len(in_force) // _SEARCHED)].tolist()
         ends = [joined.keyframes[max(k + 1 - MEMBERS, 0) : k + 1] for k in some]
         everything = UprightMap(joined.keyframes, config)
         repeated, paths = sum(map(everything.is_repeated, ends)), len(some)
     if repeated > MAX_REPEATED * paths:
-        return f"{repeated} of {counted(paths, 'path')} that agree look like other places, too"
+        return f"{repeated} of {counted(paths, 'path')} that agree also fit other locations"
     return "" if paths >= _MIN_PATHS else _SHORT
 
 
@@ -293,9 +293,9 @@ def repeated_paths(
     guest: Sequence[Keyframe],
     agreeing: NDArray[np.int64],
     config: Config,
-    most: int = _SOUGHT,
+    most: int = _SEARCHED,
 ) -> tuple[int, int]:
-    """Number of paths of the guest that fit elsewhere in one of both maps, too, and of all that agree.
+    """Numbers of agreeing paths of the guest that also fit elsewhere in either map, and of those tested.
 
     agreeing : numbers of the guest's keyframes that agree with the host; both in one frame
     most : largest number of paths, evenly spread over those that agree

@@ -1,4 +1,4 @@
-"""``scanchain localize``: a log and a map in, a directory with poses in the map's frame out."""
+"""``scanchain localize``: localizes a log in a map and writes a directory with poses in the map's frame."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ from scanchain.trajectory import read_tum, write_tum
 from scanchain.verdict import Verdict
 
 LOCALIZATION_FILE = "localization.parquet"
-_SHORT_M = {2: 5.0, 3: 20.0}  # path below which a place that is not found says nothing
-_WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without the map that is told as a stretch
-_MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # between a pose as known at its time and in the end, that is told
-_PATHS = 12  # largest number of paths that are compared with the map in the end
-_APART_S = 1.0  # largest difference between the first scan and the nearest pose of a file
-_ALIKE_SHARE = 0.5  # of the searches, from which on a log that is not found shows what is in several places
-_SHOWN = 3  # stretches that the verdict lists
+_SHORT_M = {2: 5.0, 3: 20.0}  # path of a log below which not being found in the map proves nothing
+_WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without a match with the map that is reported
+_MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # least reported difference of the live and the final pose of a scan
+_PATHS = 12  # largest number of paths of the log that are searched for elsewhere in the end
+_APART_S = 1.0  # largest time between the first scan and the nearest pose of a file
+_AMBIGUOUS_SHARE = 0.5  # least share of ambiguous searches for which a log that is not found is called ambiguous
+_SHOWN = 3  # largest number of parts that the verdict lists
 
 
 class Part(Struct, frozen=True):
-    """Consecutive scans whose place is less certain, or not known: first and last, seconds, meters of path."""
+    """Consecutive scans whose pose in the map is uncertain or unknown: first and last, seconds, meters of path."""
 
     kind: str
     first: int
@@ -58,7 +58,7 @@ class Part(Struct, frozen=True):
 
     @property
     def is_doubtful(self) -> bool:
-        """False where the log was followed all along, if by odometry alone."""
+        """False if the log was tracked throughout the part, be it by odometry alone."""
         return self.kind not in (MapState.UNMATCHED, MapState.OUTSIDE)
 
     @property
@@ -73,11 +73,11 @@ class Part(Struct, frozen=True):
 class LocalizeMetrics(Struct, frozen=True):
     """Contents of metrics.json of a localized log.
 
-    ``found_*`` say where the place of the log was first known; −1 and NaN where it never was. ``matches`` are
-    closures of keyframes with the map, ``rejected`` those that the graph left out in the end. ``log_odds`` are
-    those that the log is where it was placed, or, where they do not suffice, might have been; NaN for nothing
-    found. Standard deviations are medians, of positions as known at their time and in the end. ``ground_truth`` is
-    the accuracy of the scans that are placed.
+    ``found_*`` say where the log was first localized; −1 and NaN if it never was. ``matches`` are closures of
+    keyframes with the map, ``rejected`` those that the optimizer rejected in the end. ``log_odds`` are of the
+    location where the log was placed or, if they do not suffice, of the best one that was tested; NaN if there was
+    none. Standard deviations are medians, of live and of final positions. ``ground_truth`` is the accuracy of the
+    scans that are placed.
     """
 
     verdict: Verdict
@@ -132,10 +132,10 @@ def localize(
     *,
     initial: Initial | None = None,
 ) -> LocalizedLog:
-    """Localize a log; returns what is in the directory.
+    """Localize a log; returns the contents of the directory.
 
     map_path : run directory, or folder, of the map; draw : adds report and recording to the folder
-    initial : T_map_lidar of the first scan, where known, by the stamp of that scan and the map
+    initial : if known, function of the first scan's stamp and the map that returns T_map_lidar of that scan
     Raises InputError for a log or a map that cannot be read.
     """
     started = working_s()
@@ -143,7 +143,7 @@ def localize(
     log, settings, truth_file = opened(job)
     config = settings.config
     if not config.loops.enabled:
-        raise InputError("loops.enabled is false, but a place in a map is found by loop closures; leave it true")
+        raise InputError("loops.enabled is false, but localization in a map needs loop closures; leave it true")
     if log.dimension != prior.dimension:
         raise InputError(
             f"{log.name}: has {log.dimension}D scans, the map {prior.name} is {prior.dimension}D; give a map of "
@@ -155,8 +155,8 @@ def localize(
         compile_ahead([f"{log.dimension}d", "rest"], progress.compiling)
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(config).encode())
-        localizer = _followed(log, prior, config, initial, directory.path / POINTS_FILE, progress)
-        progress.say("smoothing the path")
+        localizer = _tracked(log, prior, config, initial, directory.path / POINTS_FILE, progress)
+        progress.say("smoothing the trajectory")
         found = localizer.finish()
         stopped = f"stopped by the user after {counted(len(found.states), 'scan')}" if progress.stopped else ""
         warnings = (*filter(None, [stopped]), *log.damage, *localizer.warnings)
@@ -183,10 +183,10 @@ def localize(
     return localized
 
 
-def _followed(
+def _tracked(
     log: Log, prior: SavedMap, config: Config, initial: Initial | None, points_file: Path, progress: Progress
 ) -> Localizer:
-    """The localizer after the scans of the log. Raises InputError where there is none."""
+    """The localizer after all scans of the log. Raises InputError if there is no scan."""
     localizer: Localizer | None = None
     with closing(log.scans(config.preprocess)) as scans:
         for scan in progress.track(scans, log.scan_count):
@@ -209,7 +209,7 @@ def measure(
     warnings: tuple[str, ...],
     ground_truth: GroundTruth | None = None,
 ) -> LocalizeMetrics:
-    """Figures and verdict of a localized log."""
+    """Metrics and verdict of a localized log."""
     first, graph = found.found_at, found.result.graph
     seconds = (found.trajectory.stamps_ns - found.trajectory.stamps_ns[0]) * 1e-9
     overlaps = [each.overlap for each in found.closures if each.verdict is ClosureVerdict.ACCEPTED]
@@ -249,7 +249,7 @@ def _median(values: NDArray[np.float64]) -> float:
 
 
 def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
-    """Parts of a log that is in the map whose place is uncertain, unknown, or was other than it was said."""
+    """Parts of a localized log whose pose in the map is uncertain, unknown, or was corrected later."""
     if found.found_at < 0:
         return
     dimension = found.trajectory.dimension
@@ -273,13 +273,13 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
 
 
 def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
-    """Reason why a log may be of another place than where it was found; empty if there is none."""
+    """Reason why a log may be from another location than where it was found; empty if there is none."""
     result, of_map, graph = found.result, len(prior.keyframes), found.result.graph
     chosen = [each for each in result.keyframes[of_map:] if found.is_placed[each.scan_index]]
     if chosen and np.isfinite(result.map_rival_log_odds):
         odds = f"log-odds {result.map_rival_log_odds:.0f} against {result.map_log_odds:.0f}"
         return f"its last keyframes match another location in the map, too ({odds})"
-    if not chosen or prior.dimension == 3 or found.found_at == 0:  # where it begins was given
+    if not chosen or prior.dimension == 3 or found.found_at == 0:  # its initial pose was given
         return ""
     placed = [replace(each, T_odom_lidar=found.trajectory.poses[each.scan_index]) for each in chosen]
     sources = graph.edges[graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < of_map), 1]
@@ -287,7 +287,7 @@ def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
     repeated, paths = repeated_paths(prior.keyframes, placed, agreeing, config, _PATHS)
     if repeated <= MAX_REPEATED * paths:
         return ""
-    return f"{repeated} of {paths} paths in it look like other places, too"
+    return f"{repeated} of {paths} paths in it also fit other locations"
 
 
 def _verdict(
@@ -297,18 +297,16 @@ def _verdict(
     tried = f"{counted(scans, 'scan')} over {path_m:.1f} m"
     if not found.is_placed.any():
         if path_m < _SHORT_M[found.trajectory.dimension]:
-            reason = f"not found in {prior.name}: {tried} are too short a path to tell"
+            reason = f"not found in {prior.name}: {tried} are too short a path to decide"
         elif np.isfinite(log_odds):
-            reason = (
-                f"not certain: {tried} may be in {prior.name}, with log-odds of {log_odds:.1f}, which are too low"
-            )
+            reason = f"not certain: {tried} may be in {prior.name}, but log-odds of {log_odds:.1f} are too low"
         elif known := scans - states[MapState.SEARCHING]:
             had = f"{counted(known, 'scan')} had a location in {prior.name} that was withdrawn"
             reason = f"not certain: of {tried}, {had}"
-        elif found.result.map_alike_share >= _ALIKE_SHARE:
-            reason = f"not certain: {tried} fit several places of {prior.name} alike"
+        elif found.result.map_alike_share >= _AMBIGUOUS_SHARE:
+            reason = f"not certain: {tried} fit several locations in {prior.name} equally well"
         else:
-            reason = f"not from this place: nothing in {tried} is in {prior.name}"
+            reason = f"not from this place: nothing in {tried} matches {prior.name}"
         return Verdict.NOT_TRUSTWORTHY, reason
     at = found.found_at
     where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")
@@ -321,14 +319,14 @@ def _verdict(
     doubt = doubt or ("" if matched else "no scan matched the map")
     doubtful = sorted((part for part in parts if part.is_doubtful), key=lambda part: -part.length_m)
     if not doubtful and not doubt:
-        return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}; {evidence}"
+        return Verdict.TRUSTWORTHY, f"{where}, and tracked: {tried}; {evidence}"
     more = f"and {len(doubtful) - _SHOWN:,} more" if len(doubtful) > _SHOWN else ""
     reasons = [where, evidence, doubt, *(part.text for part in doubtful[:_SHOWN]), more]
     return Verdict.CHECK, "; ".join(filter(None, reasons))
 
 
 def pose_near(x_m: float, y_m: float, yaw_deg: float) -> Initial:
-    """T_map_lidar at a position and heading; in space height and tilt are those of the nearest keyframe."""
+    """T_map_lidar at a position and heading; in 3D, height and tilt are those of the nearest keyframe."""
 
     def pose(stamp_ns: int, prior: SavedMap) -> Pose:
         planar = lie.pose_2d(x_m, y_m, np.radians(yaw_deg))
@@ -346,7 +344,7 @@ def pose_near(x_m: float, y_m: float, yaw_deg: float) -> Initial:
 
 
 def pose_in_file(path: Path) -> Initial:
-    """T_map_lidar of the first scan by a TUM file."""
+    """T_map_lidar of the first scan from a TUM file."""
     trajectory = read_tum(path)
 
     def pose(stamp_ns: int, prior: SavedMap) -> Pose:
@@ -377,10 +375,10 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) 
     if m.found_scan >= 0 and np.isfinite(m.log_odds):
         lines.append(f"evidence       log-odds of {m.log_odds:.0f} that this location is right")
     if m.matches:
-        left_out = f", {m.rejected:,} of them left out" if m.rejected else ""
+        left_out = f", {m.rejected:,} of them rejected" if m.rejected else ""
         lines += [
             f"matches        {m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)",
-            f"sigma          {m.median_sigma_m:.3f} m at its time, {m.median_final_sigma_m:.3f} m in the end: "
+            f"sigma          {m.median_sigma_m:.3f} m live, {m.median_final_sigma_m:.3f} m final: "
             "standard deviation of a position (median)",
         ]
     if m.ground_truth is not None:
@@ -393,7 +391,7 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) 
 
 
 def _write(folder: Path, localized: LocalizedLog) -> None:
-    """Trajectories, summary, metrics and the table: a row a scan, poses null where unknown."""
+    """Trajectories, summary, metrics and the table: one row per scan, poses null where unknown."""
     found = localized.localization
     if found.is_placed.any():
         write_tum(folder / "trajectory.tum", found.placed)

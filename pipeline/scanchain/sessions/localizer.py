@@ -1,4 +1,4 @@
-"""Localization in a map from nowhere: odometry, joined to the map by loop closures once its place is known."""
+"""Global localization in a map: odometry, joined to the map by loop closures once its location is known."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from scanchain.placement import loop_information
 from scanchain.preprocess import Prepared
 from scanchain.slam import Slam, SlamResult
 
-_RECENT_KEYFRAMES = 3  # since the last match with the map, up to which a scan counts as localized
+_RECENT_KEYFRAMES = 3  # largest number since the last match with the map for a scan to count as localized
 INITIAL_SIGMAS = (2.0, 0.35)  # m and rad, standard deviations of a pose that the user gives
 
 
 class MapState(StrEnum):
-    """Knowledge of where a scan is in the map."""
+    """What is known about the pose of a scan in the map."""
 
     SEARCHING = "searching"
     LOCALIZED = "localized"
@@ -37,12 +37,12 @@ class MapState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A scan in the map, as known at its time.
+    """A scan with its pose in the map as estimated online.
 
-    state : how it is known; of one that is ``LOST`` the pose is predicted
+    state : how the pose is known; while ``LOST`` it is only predicted
     T_map_lidar : pose in the map's frame, None while ``SEARCHING``
     covariance : (k, k) of a twist in the lidar's own frame, None while ``SEARCHING``
-    step : its odometry and what was compared with the map
+    step : its odometry and its closures with the map
     """
 
     __repr__ = brief
@@ -54,17 +54,17 @@ class Placed:
 
 @dataclass(frozen=True, slots=True)
 class Localization:
-    """A log in a map, after its last scan.
+    """A log localized in a map, after its last scan.
 
-    states : (N,) of every scan, as known at its time
-    is_placed : (N,) bool, scans that are joined to the map in the end, those before they were found too
-    trajectory : every scan, T_map_lidar; without meaning where not ``is_placed``
-    live : (N, d+1, d+1) poses as known at the time, NaN while searching
-    sigma_m : (N,) standard deviation of the position at the time, NaN while searching
-    final_sigma_m : (N,) of the position in the end, NaN where not placed
+    states : (N,) online state of every scan
+    is_placed : (N,) bool, scans that are connected to the map in the end, also those before it was found
+    trajectory : final T_map_lidar of every scan; meaningless where not ``is_placed``
+    live : (N, d+1, d+1) poses as estimated online, NaN while searching
+    sigma_m : (N,) standard deviation of the live position, NaN while searching
+    final_sigma_m : (N,) of the final position, NaN where not placed
     traveled_m : (N,) length of the path up to each scan, by odometry
-    closures : with keyframes of the map, or tried
-    result : of the whole chain, keyframes of the map first
+    closures : tried with keyframes of the map, accepted or not
+    result : of the whole SLAM chain, keyframes of the map first
     """
 
     __repr__ = brief
@@ -80,21 +80,21 @@ class Localization:
 
     @property
     def placed(self) -> Trajectory:
-        """Those of its scans that are placed."""
+        """The final trajectory of the scans that are placed."""
         return Trajectory(self.trajectory.stamps_ns[self.is_placed], self.trajectory.poses[self.is_placed])
 
     @property
     def found_at(self) -> int:
-        """The first scan whose place was known at its time, −1 if there is none."""
+        """The first scan whose pose in the map was known online, −1 if there is none."""
         known = np.flatnonzero(self.states != MapState.SEARCHING)
         return int(known[0]) if len(known) and self.is_placed.any() else -1
 
 
 class Localizer:
-    """Places the scans of a log in a map, which stays as it is.
+    """Localizes the scans of a log in a map, which stays unchanged.
 
-    Until its place is found the log is followed by odometry alone. Then every keyframe is matched to the map
-    around it, and every scan to those before; matches with the map that contradict the others are left out.
+    Until its location is found, the log is tracked by odometry alone. Then every keyframe is matched to the map
+    around it, and every scan to those before; matches with the map that contradict the others are rejected.
     """
 
     def __init__(
@@ -107,13 +107,13 @@ class Localizer:
         points_file: Path | None = None,
         is_live: bool = True,
     ) -> None:
-        """Begin in a map.
+        """Start in a map.
 
         prior : the map, or the run directory that holds it
         config, T_base_lidar, points_file : as in ``Slam``
-        is_live : whether a search of a large map goes on over several scans, so that none of them waits for it;
-            else it is completed at once, which finds the log after a shorter path
-        initial : T_map_lidar of the first scan where it is known, to a few meters and 20°
+        is_live : whether a search of a large map is spread over several scans, so that no scan waits for it; else
+            it is completed at once, which localizes the log after a shorter path
+        initial : T_map_lidar of the first scan if known to within a few meters and 20°
         Raises InputError for a map that cannot be read.
         """
         self.map = prior if isinstance(prior, SavedMap) else open_saved_map(checks.path(prior, "prior"))
@@ -127,9 +127,9 @@ class Localizer:
         self.start_m = self.slam.trail.traveled_m
         self.is_in_map = False
         self.state = MapState.SEARCHING  # of the newest keyframe
-        self.covariance = np.empty((0, 0))  # of its pose, but for its own error, once it is in the map
+        self.covariance = np.empty((0, 0))  # of its pose without its own error, once it is in the map
         self.own = self.covariance  # covariance of its own error
-        self.by_map: Closure | None = None  # its match, or the last one before
+        self.by_map: Closure | None = None  # the latest match with the map
 
     def __repr__(self) -> str:
         state = self.states[-1] if self.states else MapState.SEARCHING
@@ -143,17 +143,17 @@ class Localizer:
         *,
         T_odom_base: Pose | None = None,
     ) -> Placed:
-        """Place a scan as a driver gives it; arguments as in ``Odometry.track``."""
+        """Localize a scan as a driver delivers it; arguments as in ``Odometry.track``."""
         scan = Scan.of(points, stamp_s, times_s, index=len(self.states), T_odom_base=T_odom_base)
         return self.slam.live_stamps.passed(scan, self.process)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Lines on wheels that were left out."""
+        """Warnings about wheel odometry that was rejected."""
         return self.slam.front_end.odometry.predictor.warnings()
 
     def process(self, scan: Scan | Prepared) -> Placed:
-        """Place one scan of a log."""
+        """Localize one scan of a log."""
         step = self.slam.process(scan)
         if self.initial is not None and len(self.states) == 0:
             self.slam.placement.begin_at(self.initial, INITIAL_SIGMAS)
@@ -167,14 +167,14 @@ class Localizer:
         return placed
 
     def finish(self) -> Localization:
-        """Match what is left and smooth the whole path; scans before the place was found are placed as well."""
+        """Complete matching and smooth the whole path; scans from before the log was found are placed, too."""
         result, first = self.slam.finish(), self.slam.trail.first
         scans = [keyframe.scan_index for keyframe in result.keyframes[first:]]
         keyframe_of = np.searchsorted(scans, np.arange(len(result.trajectory)), side="right") - 1
         is_placed = (result.components[first:] == result.components[0])[keyframe_of]
         final_sigma_m = np.full(len(is_placed), np.nan)
         if is_placed.any():
-            graph, own = with_map_errors(result.graph, result.map_errors, self.slam.config)  # the map is held
+            graph, own = with_map_errors(result.graph, result.map_errors, self.slam.config)  # the map is fixed
             variances = np.diagonal((graph.covariances() + own)[first:], axis1=1, axis2=2)[:, : graph.dimension]
             final_sigma_m[is_placed] = np.sqrt(variances.sum(axis=1))[keyframe_of[is_placed]]
         return Localization(
@@ -225,13 +225,13 @@ class Localizer:
             self.state = MapState.UNMATCHED if is_known else MapState.OUTSIDE
 
     def _errors(self, information: Matrix, keyframe: int, *, is_loop: bool) -> tuple[Matrix, Matrix]:
-        """Covariances (k, k) of an edge to a keyframe, and of the pose of that by itself."""
+        """Covariances (k, k) of an edge to a keyframe, and of that keyframe's own pose error."""
         errors = self.slam.trail.map_errors[keyframe : keyframe + 1]
         edge, own = edge_errors(information, np.array([is_loop]), errors, self.slam.config)
         return edge[0], own[0]
 
 
 def _moved(covariance: Matrix, keyframe: Keyframe, T_odom_lidar: Pose) -> Matrix:
-    """Covariance of the pose of a keyframe as that of another pose, whose motion from it is known."""
+    """Covariance of a keyframe's pose, transformed to that of another pose at a known motion from it."""
     Ad = lie.adjoint(lie.between(T_odom_lidar, keyframe.T_odom_lidar))
     return Ad @ covariance @ Ad.T

@@ -1,6 +1,6 @@
-"""The map of several sessions: final poses of their keyframes and scans, what is gone from them, and its files.
+"""The map of several sessions: final poses of their keyframes and scans, removal of vanished points, and files.
 
-An updated map follows its newest session: points of older keyframes that newer sessions saw through are removed.
+Updating a map removes the points of older keyframes that newer sessions saw through.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from scanchain.trajectory import read_tum, write_tum
 
 @dataclass(frozen=True, slots=True)
 class MergedMap:
-    """Maps in one frame, with their sessions.
+    """Several maps merged in one frame, with their sessions.
 
-    joined : the graph
-    saved : the map; its poses are in the plane finer than those of the graph, its sessions, of all maps, in the
-        order of time with names that differ
-    trajectories : of the sessions; of all scans where a run has them, else of the keyframes
-    removed : (K,) number of each keyframe's points that newer sessions saw through, where the map was updated
+    joined : the maps with their common graph
+    saved : the merged map; in 2D its poses are refined beyond those of the graph; the sessions of all maps are in
+        chronological order, with unique names
+    trajectories : of the sessions; of all scans if the run directory has them, else of the keyframes
+    removed : (K,) number of each keyframe's points that newer sessions saw through; 0 without an update
     warnings : of the update
     """
 
@@ -52,7 +52,7 @@ class MergedMap:
 def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> list[list[str]]:
     """Names of the sessions of each map.
 
-    A run of one log is called by its directory; of equal names the later ones, in this order, get a number.
+    A run of one log is named after its directory; where names are equal, the later ones in ``order`` get a number.
     """
     names: list[list[str]] = [[] for _ in maps]
     taken = set[str]()
@@ -143,7 +143,7 @@ def _refined(joined: Joined, config: Config, held: int) -> Matrix:
 
 
 def _trajectory(saved: SavedMap, index: int, poses: Matrix) -> Trajectory:
-    """Poses of a session's scans, from its first keyframe on, moved along with its keyframes (K, d+1, d+1)."""
+    """Poses of a session's scans from its first keyframe on, corrected to its keyframes' poses (K, d+1, d+1)."""
     keyframes = [saved.keyframes[k] for k in np.flatnonzero(saved.session == index).tolist()]
     stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
     before = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
@@ -176,7 +176,7 @@ class RemainingPoints:
 
 
 def updated(merged: MergedMap, config: Config) -> MergedMap:
-    """The map without what vanished from one session to the next; warns of sessions that fit on none before."""
+    """The map without points that vanished in later sessions; warns of sessions that match none before."""
     saved, session, poses = merged.saved, merged.saved.session, merged.saved.poses
     result, removed, warnings = list(saved.keyframes), merged.removed.copy(), list(merged.warnings)
     for number, newest in enumerate(saved.sessions[1:], 1):
@@ -187,7 +187,7 @@ def updated(merged: MergedMap, config: Config) -> MergedMap:
         try:
             changes = changes_between(earlier, later, config)
         except InputError:
-            warnings.append(f"{newest.name}: too little in common with older sessions, nothing removed by it")
+            warnings.append(f"{newest.name}: too little in common with older sessions; it removed no points")
             continue
         if not (changes.labels == Label.VANISHED).any():
             continue

@@ -1,4 +1,4 @@
-"""Merging: run directories of one place in, one map out."""
+"""Merging of the maps of several runs into one map."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from scanchain.settings import dump, load_settings
 class SessionMetrics(Session, frozen=True):
     """A session as it is in the merged map.
 
-    closures : in force between it and other maps
-    removed_points : of its keyframes, that newer sessions saw through; 0 where the map was not updated
+    closures : number in force between it and other maps
+    removed_points : number of points of its keyframes that newer sessions saw through; 0 without an update
     """
 
     closures: int
@@ -43,12 +43,12 @@ class SessionMetrics(Session, frozen=True):
 class MergeMetrics(msgspec.Struct, frozen=True):
     """Contents of metrics.json of a merge.
 
-    sessions : those in the map, in the order of time
-    apart : those that are not, each with the other sessions of its own place, if any
-    closures_tried, closures_in_force : between maps
+    sessions : in the map, in chronological order
+    apart : sessions that are not in it, in groups that belong together
+    closures_tried, closures_in_force : numbers of closures between maps
     chi2, degrees_of_freedom, certified, certificate : of the pose graph
     map_points, moving_points_removed : of map.ply
-    updated : whether the map follows its newest session
+    updated : whether points that newer sessions saw through were removed
     uncertain : joins without enough evidence
     run_s : wall time, without compilation
     """
@@ -87,10 +87,10 @@ class Merged:
 def merge(
     job: Job, progress: Progress, report: Callable[[Path], None], *, fixed: bool = False, update: bool = False
 ) -> Merged:
-    """Join the maps of runs, write a directory, to which ``report`` adds page and recording in the end.
+    """Merge the maps of runs into a new run directory, to which ``report`` then adds report and recording.
 
     job : its ``logs`` are run directories, or map folders; the first one's frame is that of the merged map
-    fixed : whether the keyframes of the first run stay where they are, to the bit
+    fixed : whether the poses of the first run's keyframes stay the same, bit for bit
     update : whether points that newer sessions saw through are removed from the keyframes of older ones
     Raises InputError for bad input, and ScanchainError where no two maps belong together.
     """
@@ -137,14 +137,14 @@ def merge(
 def _opened(runs: Sequence[Path], out: Path) -> list[SavedMap]:
     """The maps of runs. Raises InputError where they cannot be merged."""
     if len(runs) < 2:
-        raise InputError("merge takes two run directories or more; name another one")
+        raise InputError("merge needs at least two run directories; give another one")
     maps = opened_maps(runs, out)
     holders: dict[tuple[int, int, int], Path] = {}
     for run, saved in zip(runs, maps, strict=True):
         for session in saved.sessions:
             key = (session.first_stamp_ns, session.last_stamp_ns, session.keyframes)
             if key in holders:
-                raise InputError(f"{run}: holds a session that {holders[key]} holds, too; leave one of them out")
+                raise InputError(f"{run}: holds a session that {holders[key]} also holds; leave one of them out")
             holders[key] = run
     return maps
 
@@ -154,12 +154,12 @@ def _check_order(sessions: Sequence[Session]) -> None:
     for before, after in pairwise(sorted(sessions, key=lambda session: session.first_stamp_ns)):
         if before.first_stamp_ns == after.first_stamp_ns:
             raise InputError(
-                f"{before.name}, {after.name}: begin at the same time, none is newer; leave out --update"
+                f"{before.name}, {after.name}: begin at the same time, so neither is newer; leave out --update"
             )
 
 
 def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
-    """Numbers of the maps, the held one first, then the largest, whatever order they were named in."""
+    """Numbers of the maps in canonical order: the fixed one first, then by decreasing size."""
 
     def key(number: int) -> tuple[object, ...]:
         saved = maps[number]
@@ -170,7 +170,7 @@ def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
 
 
 def _chosen(groups: Sequence[Joined], held: int, maps: Sequence[SavedMap], uncertain: Sequence[Doubt]) -> Joined:
-    """The group with the held map, else the one of most maps and, of equal ones, keyframes."""
+    """The group with the fixed map, else the one with the most maps or, if equal, the most keyframes."""
     chosen = max(groups, key=lambda group: (held in group.maps, len(group.maps), len(group.keyframes)))
     if len(chosen.maps) > 1:
         return chosen
@@ -193,15 +193,15 @@ def _apart_text(names: Sequence[str], uncertain: Sequence[Doubt]) -> str:
 
 def _changed_text(name: str, share: float) -> str:
     return (
-        f"{name}: {100.0 * share:.1f} % of what it and the others had in sight differs; much has changed, or "
-        "it is of another floor of the same plan; then leave it out"
+        f"{name}: {100.0 * share:.1f} % of what both it and the others observed differs: much has changed, or "
+        "it was recorded on another floor with the same plan; in that case, leave it out"
     )
 
 
 def _measured(
     merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config, held: int, **of_merge: Any
 ) -> MergeMetrics:
-    """The metrics of a map; ``of_merge`` are those of what joined it."""
+    """The metrics of a merged map; ``of_merge`` are the fields about the merge itself."""
     joined, saved, graph = merged.joined, merged.saved, graph_of(merged.joined, held)
     state = graph.optimize(config.graph, initialize="given").state
     certificate = graph.certify()

@@ -1,4 +1,4 @@
-"""Worlds with exact ground truth, written as MCAP."""
+"""Simulated worlds with exact ground truth, written as MCAP."""
 
 from scanchain.simulation.another_day import Change
 from scanchain.simulation.drive import NO_SLIP, Drive, Slip, plan, record, simulate

@@ -1,4 +1,4 @@
-"""A world on another day: movable objects taken away, moved within sight of where they stood, or added."""
+"""A world on another day: movable objects removed, moved within sight of where they stood, or added."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from scanchain.data import Matrix, Pose
 from scanchain.kernels.raycast import BOX, ELLIPSOID
 from scanchain.simulation.solids import FIXED, Solids
 
-_VANISHED, _MOVED, _APPEARED = 0.12, 0.15, 0.08  # shares of the objects that go, move, and get a copy elsewhere
+_VANISHED, _MOVED, _APPEARED = 0.12, 0.15, 0.08  # shares of the objects removed, moved, and copied elsewhere
 _APART_M = (0.5, 4.0)  # distance of the move
-_TURN_RAD = 0.15  # standard deviation of the turn, beside quarter turns
+_TURN_RAD = 0.15  # standard deviation of the turn, in addition to quarter turns
 _TRIES = 20
-_ROOM_M = 0.05  # distance kept from other solids
+_ROOM_M = 0.05  # least distance from other solids
 _SAMPLE_M = 0.1  # spacing of the points of a footprint
-_NEAR_M = 8.0  # solids so far from an object can be in its way
-_BELOW_M = 2.0  # solids that begin higher are in nobody's way
+_NEAR_M = 8.0  # solids up to this far from an object can overlap with it
+_BELOW_M = 2.0  # solids that begin higher cannot overlap with an object
 _COLUMNS = (
     *("kind", "x_before", "y_before", "z_before", "x_after", "y_after", "z_after"),
     *("length", "width", "height"),
@@ -34,8 +34,8 @@ _COLUMNS = (
 class Change:
     """A movable object that is not where it was on the first day.
 
-    before, after : (3,) middle of its bounding box, meters; NaN where it was or is not there
-    size_m : (3,) length, width and height of its upright bounding box when it was at yaw 0
+    before, after : (3,) center of its bounding box, meters; NaN if it did not exist then
+    size_m : (3,) extent of its bounding box along x, y and z of the world, in its pose on the first day
     owner : number of the object among the solids of both days
     """
 
@@ -46,16 +46,16 @@ class Change:
     owner: int
 
     def seen_from(self, T: Pose) -> Change:
-        """The same, moved by a pose (4, 4), as into the frame of a map."""
+        """The same change, transformed by a pose (4, 4), for example into the frame of a map."""
         return replace(self, before=lie.transform(T, self.before), after=lie.transform(T, self.after))
 
 
 def another_day(
     solids: Solids, path: Matrix, free_m: float, rng: np.random.Generator
 ) -> tuple[Solids, tuple[Change, ...]]:
-    """The same place with changes, drawn from ``rng``, of its movable objects.
+    """The same solids with random changes of the movable objects, and these changes.
 
-    path : (N, 2) positions from which objects keep ``free_m``
+    path : (N, 2) positions; moved and added objects are more than ``free_m`` away from them
     """
     changes, objects = list[Change](), int(solids.owner.max(initial=FIXED)) + 1
     for owner in range(objects):
@@ -82,7 +82,7 @@ def another_day(
 
 
 def write_changes(path: Path, changes: Sequence[Change]) -> None:
-    """Write a line for each change: kind, middle before and after, size; meters, empty where it is not there."""
+    """Write a CSV row per change: kind, center before and after, size; meters, empty if it does not exist then."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_COLUMNS)
@@ -94,7 +94,7 @@ def write_changes(path: Path, changes: Sequence[Change]) -> None:
 def _elsewhere(
     thing: Solids, solids: Solids, path: Matrix, free_m: float, rng: np.random.Generator
 ) -> Solids | None:
-    """The object somewhere near, where it is free and nothing fixed stands between; None if none was found."""
+    """The object at a free pose nearby with nothing fixed in between; None if no such pose was found."""
     here, fixed = _middle(thing), solids.part(solids.owner == FIXED)
     for _ in range(_TRIES):
         away_m, direction = rng.uniform(*_APART_M), rng.uniform(0.0, 2.0 * np.pi)
@@ -117,7 +117,7 @@ def _is_free(thing: Solids, solids: Solids, path: Matrix, free_m: float) -> bool
 
 
 def _clearance_m(solids: Solids, xy: Matrix) -> float:
-    """Least distance of positions (N, 2) from the solids around, inf where none is near."""
+    """Least distance of positions (N, 2) from nearby solids, inf if there are none."""
     away_m = np.linalg.norm(solids.rows[:, 1:3] - xy.mean(axis=0), axis=1)
     near = away_m < _NEAR_M + 1.5 * solids.rows[:, 3:5].max(axis=1)
     return float(solids.part(near).clearance_m(xy, _BELOW_M).min())
@@ -132,13 +132,13 @@ def _box(thing: Solids) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _middle(thing: Solids) -> NDArray[np.float64]:
-    """(3,) of its bounding box."""
+    """Center (3,) of its bounding box."""
     low, high = _box(thing)
     return 0.5 * (low + high)
 
 
 def _footprint(thing: Solids) -> Matrix:
-    """Points (N, 2) all over what it covers of the ground: on boxes, on rims of ellipses and in their centers."""
+    """Points (N, 2) on its footprint: all over boxes, on the rims and at the centers of ellipses."""
     parts = []
     for kind, x, y, half_x, half_y, c, s, _, _ in thing.rows:
         if kind == BOX:
@@ -153,7 +153,7 @@ def _footprint(thing: Solids) -> Matrix:
 
 
 def _moved(thing: Solids, shift: NDArray[np.float64], turn_rad: float) -> Solids:
-    """Turned about its middle, then shifted by (3,); ellipsoids keep their axes."""
+    """The object, turned about its center, then shifted by (3,); ellipsoids keep their axes."""
     middle = _middle(thing)[:2]
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     turn = np.array([[c, -s], [s, c]])

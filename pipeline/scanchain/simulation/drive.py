@@ -1,4 +1,4 @@
-"""A drive through a world: planned, and recorded as an MCAP log with its exact truth."""
+"""A drive through a world: planned, and recorded as an MCAP log with exact ground truth."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from scanchain.simulation.worlds import WORLDS, World
 from scanchain.trajectory import write_tum
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
-_PLACE, _DEVIATION, _WHEELS, _RANGES = range(4)  # every purpose draws its own random numbers
+_PLACE, _DEVIATION, _WHEELS, _RANGES = range(4)  # each purpose has random numbers of its own
 _ODOMETRY_PERIOD_NS = 20_000_000
 _DROPOUT_S = 1.0
-_PATH_STEP_S = 0.1  # between the positions of a drive that objects must not be moved to
-_SPARE_M = 0.25  # distance that they keep from it, besides half the vehicle's width
+_PATH_STEP_S = 0.1  # between the positions of a drive that objects keep clear of
+_SPARE_M = 0.25  # their distance from it, beyond the vehicle's half width and deviation
 _LONGEST_S = 36_000.0
 _FARTHEST_M = 1e5
 
 
 class Slip(NamedTuple):
-    """Distance that the wheels turn ahead without moving the vehicle, evenly between two seconds of the drive."""
+    """Distance that the wheels roll without moving the vehicle, spread evenly between two times of the drive."""
 
     start_s: float
     end_s: float
@@ -48,12 +48,12 @@ NO_SLIP = Slip(0.0, 1.0, 0.0)
 class Drive:
     """A drive to record.
 
-    sensor : its reach is what the world lets it see
+    sensor : its maximum range is limited by the visibility in the world
     T_base_lidar : (4, 4)
-    scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts
+    scans : (K,) int64, numbers of the recorded scans, counted from the start; the others fall into dropouts
     seed, changed : of all random numbers; ``changed`` is None on the first day
     drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
-    solids_of_instant : the solids at the begin of a scan, where some of them move
+    solids_of_instant : the solids at the start of a scan, if some of them move
     changes : of the world since the drive of the same seed on the first day
     """
 
@@ -103,13 +103,14 @@ def plan(
     start_s, end_s, size_m = wheels_slip
     if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
         raise InputError(
-            f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
+            f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: must begin at 0 s or later and end "
+            "after that"
         )
     solids = scene.build(_random(seed, _PLACE))
     driven_s = length_s + lidar.period_ns * 1e-9
     if isinstance(scene.route, tuple):
         if reverse or start_m:
-            raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
+            raise InputError(f"{world} has no closed route; leave out reverse and start_m")
         moving = partial(pivots, scene.route, scene.vehicle, solids, duration_s=driven_s)
     else:
         route = begun_at(scene.route[::-1] if reverse else scene.route, start_m)
@@ -133,7 +134,7 @@ def _random(seed: int, purpose: int, changed: int | None = None) -> np.random.Ge
     """Random numbers for one purpose of a drive, on the first day or another one."""
     for name, number in (("seed", seed), ("changed", changed or 0)):
         if number < 0:
-            raise InputError(f"{name} {number} is negative; choose one from 0 up")
+            raise InputError(f"{name} {number} is negative; choose 0 or a positive number")
     day = () if changed is None else (changed,)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, *day)))
 
@@ -144,7 +145,7 @@ def _check_range(name: str, value: float, low: float, high: float) -> None:
 
 
 def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArray[np.int64]:
-    """All scans outside the dropouts: one second each, centered on the first moment nearest to its location."""
+    """Numbers of all scans outside the dropouts: 1 s each, around the closest point of the first visit."""
     kept = np.ones(count, dtype=bool)
     lacking = round(_DROPOUT_S * 1e9 / sensor.period_ns)
     times_s = np.arange(count) * (sensor.period_ns * 1e-9)
@@ -182,21 +183,21 @@ def simulate(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> Trajectory:
-    """Write a log of a drive to ``destination`` and the truth beside it as .tum; the same seed, the same bytes.
+    """Write a log of a drive to ``destination``, next to it the truth as .tum; the same seed gives the same bytes.
 
-    A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
+    A scan's stamp is the instant of its first ray, point times are relative to it, and it is logged at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
-    of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on.
+    of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, only /odom continues.
 
-    force : whether files that exist are replaced
-    progress : called with the scans done and in all
-    options : ``seed``, 0 if it is not given; ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in
+    force : whether existing files are replaced
+    progress : called with the number of scans done and the total
+    options : ``seed``, 0 by default; ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in
         place of the sensor's own; ``drift``, which multiplies the errors of the wheel odometry, and
-        ``wheels_slip``, by which it slips once; ``reverse`` to drive the other way round, from ``start_m`` along
-        that route; ``changed``, a seed, for another day: furniture or parked cars came, went and moved, as
-        .changes.csv beside the log lists, and the drive is repeated with other deviations and noise
+        ``wheels_slip``, by which it slips once; ``reverse`` to drive in the opposite direction, from ``start_m``
+        along that route; ``changed``, a seed, for another day: furniture or parked cars appeared, vanished or
+        moved, as listed in .changes.csv next to the log, and the drive is repeated with other deviations and noise
 
-    Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
+    Returns the ground truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
     return record(plan(world, **options), destination, force=force, progress=progress)
 
@@ -208,7 +209,7 @@ def record(
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
-    """Write a log of any drive, as ``simulate`` does of one that is planned, and what lies beside it."""
+    """Write a log of any drive, and next to it the same files as ``simulate``."""
     destination = checks.path(destination, "destination")
     changes_file = destination.with_suffix(".changes.csv")
     for file in (destination.with_suffix(".tum"), *(() if drive.changed is None else (changes_file,))):
@@ -236,7 +237,7 @@ def record(
 
 
 def _sweeps(drive: Drive) -> Iterator[Sweep]:
-    """All recorded scans in order; the next is cast in a thread while the last is written."""
+    """All recorded scans in order; the next is cast in a thread while the previous one is written."""
     rng = _random(drive.seed, _RANGES, drive.changed)
 
     def take(index: int) -> Sweep:

@@ -1,4 +1,4 @@
-"""Motion of a vehicle: laps round a closed route, turns on the spot with short moves; odometry of its wheels."""
+"""Motion of a vehicle: laps around a closed route, turns on the spot with short moves; odometry of its wheels."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from scanchain.simulation.solids import Solids
 
 _SWAY_HERTZ = np.array([1.3, 0.9, 1.1, 0.8, 0.6])  # heave, roll, pitch, sideways, heading
 
-_SCALE_SHARE = 0.01  # error of the distance as a share: wheels are not as large as assumed
-_TURN_SHARE = 0.02  # error of the angle as a share: nor as far apart
-_BIAS_RAD_PER_M = 0.0005  # turn for each meter, as one wheel is larger than the other
+_SCALE_SHARE = 0.01  # relative error of the distance: the wheels are not of the assumed size
+_TURN_SHARE = 0.02  # relative error of the angle: the wheels are not at the assumed distance
+_BIAS_RAD_PER_M = 0.0005  # turn per meter, because one wheel is larger than the other
 _NOISE_M = 0.01  # slip along the path, per √m
 _NOISE_RAD = 0.004  # slip in heading, per √m
 
@@ -34,11 +34,11 @@ class Vehicle:
     radius_m : half its width
     T_base_lidar : (4, 4)
     corner_m : standard deviation of the smoothing that rounds the route; a right angle gets 0.9 of it as radius
-    deviation_m : how far it strays from the route, differently on every lap
+    deviation_m : largest deviation from the route in x and in y, different on every lap
     sway_rad, heave_m : roll, pitch and height of the body at full speed, amplitudes
     swing_rad, swing_m : heading and sideways motion of the body at full speed, amplitudes
     start_m_s : speed at the first instant
-    standstill_s : how long it stands before it sets off
+    standstill_s : how long it stands still before it starts
     """
 
     speed_m_s: float
@@ -57,12 +57,12 @@ class Vehicle:
 
 
 def mount(x_m: float, z_m: float) -> Matrix:
-    """T_base_lidar (4, 4) of a lidar that looks ahead, so far before and above the base."""
+    """T_base_lidar (4, 4) of a forward-facing lidar, ``x_m`` ahead of and ``z_m`` above the base."""
     return np.array([[1.0, 0, 0, x_m], [0, 1, 0, 0], [0, 0, 1, z_m], [0, 0, 0, 1]])
 
 
 class Course(NamedTuple):
-    """Positions (N, 2) on the ground or (N, 3) at heights of their own, unit vectors (N, 2) ahead, speeds (N,)."""
+    """Positions (N, 2) on the ground or (N, 3) with given heights, forward unit vectors (N, 2), speeds (N,)."""
 
     place: Matrix
     forward: Matrix
@@ -71,7 +71,7 @@ class Course(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A vehicle's motion along a course, whose pose is known at any instant.
+    """A vehicle's motion along a course, with its pose at any instant.
 
     ``course`` at (N,) instants; ``phases`` (5,) of the body's sway.
     """
@@ -90,7 +90,7 @@ class Motion:
             height_m, slope = place[:, 2], np.zeros_like(forward)
         poses = _stand(place[:, :2], height_m, slope, forward)
         v = self.vehicle
-        if v.sway_rad > 0.0 or v.heave_m > 0.0:  # a body on its springs or legs, the more the faster it goes
+        if v.sway_rad > 0.0 or v.heave_m > 0.0:  # sway of a body on springs or legs, proportional to its speed
             sizes = np.array([v.heave_m, v.sway_rad, v.sway_rad, v.swing_m, v.swing_rad])
             waves = np.sin(2.0 * np.pi * _SWAY_HERTZ * times_s[:, None] + self.phases)
             twists = np.zeros((len(times_s), 6))
@@ -104,7 +104,7 @@ class Motion:
 
 
 def _stand(xy: Matrix, height_m: NDArray[np.float64], slope: Matrix, forward: Matrix) -> Matrix:
-    """Poses (N, 4, 4) at that height that look along ``forward`` (N, 2), z normal to a ``slope`` (N, 2)."""
+    """Poses (N, 4, 4) at these heights, x along ``forward`` (N, 2), z normal to a ground with ``slope`` (N, 2)."""
     ahead = np.column_stack([forward, np.sum(slope * forward, axis=1)])
     up = np.column_stack([-slope, np.ones(len(xy))])
     poses = np.zeros((len(xy), 4, 4))
@@ -122,9 +122,9 @@ def wheel_odometry(
 ) -> Matrix:
     """T_odom_base (N, 3, 3) that wheels report for the poses (N, 4, 4), starting at the identity.
 
-    Each step is wrong by a scale and a bias that stay the same for the whole drive, drawn from ``rng``, and by
-    noise that grows with the root of the distance. ``drift`` multiplies every error; 0 is the planar truth.
-    ``slips_m`` (N-1,) is what they turn ahead in a step without moving the vehicle, below 0 what they do not turn.
+    Each step has errors of scale and a bias, sampled once for the whole drive, and noise that grows with the
+    square root of the distance. ``drift`` multiplies every error; 0 is the planar truth.
+    ``slips_m`` (N-1,) : what they roll per step without moving the vehicle, negative if they roll too little
     """
     planar = lie.flatten(T_world_base)
     steps = lie.inverse(planar[:-1]) @ planar[1:]
@@ -143,21 +143,21 @@ def wheel_odometry(
     return poses
 
 
-_HOLD_S = 1.0  # before it sets off, as long as the easing reaches
+_HOLD_S = 1.0  # standstill before the start, as long as the smoothing extends
 _STEP_S = 0.02  # spacing of the speed profile
 _EASE_S = 0.25  # standard deviation of the smoothing that makes the acceleration continuous
-_MARGIN_S = 2.0  # the profile begins and ends that much beyond the drive
+_MARGIN_S = 2.0  # the profile extends this far beyond both ends of the drive
 
 TURN_RAD_S = np.deg2rad(120.0)
 _TURN_RAD_S2 = np.deg2rad(400.0)
 _PIVOT_STEP_S = 0.005  # spacing of the profiles
 _PIVOT_EASE_S = 0.05  # standard deviation of the smoothing that makes the accelerations continuous
-_PAUSE_S = 0.4  # between a turn and a move, as long as the easing reaches on both sides
+_PAUSE_S = 0.4  # between a turn and a move, as long as the smoothing extends on both sides
 _FIRST_PAUSE_S = 1.0  # standstill at the beginning
 
 
 class Lap:
-    """A closed route (W, d) by the distance along it; ``corners_m`` (W + 1,) are those of its corners."""
+    """A closed route (W, d), parametrized by the distance along it; ``corners_m`` (W + 1,) are its corners'."""
 
     def __init__(self, route: Matrix) -> None:
         self._corners = np.vstack([route, route[:1]])
@@ -165,7 +165,7 @@ class Lap:
         self.length_m = float(self.corners_m[-1])
 
     def at(self, along_m: NDArray[np.float64] | float) -> Matrix:
-        """Positions (..., d), on whichever lap."""
+        """Positions (..., d) at distances along the route, on any lap."""
         place_m = along_m % self.length_m
         return np.stack([np.interp(place_m, self.corners_m, column) for column in self._corners.T], axis=-1)
 
@@ -175,7 +175,7 @@ class Lap:
         return float(np.arctan2(ahead[1], ahead[0]))
 
     def beside(self, along_m: float, left_m: float) -> tuple[float, float]:
-        """The position so far along a route on the ground and to its left."""
+        """The position ``along_m`` along a route on the ground and ``left_m`` to its left."""
         yaw_rad = self.yaw_rad(along_m)
         x, y = self.at(along_m) + left_m * np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
         return float(x), float(y)
@@ -184,7 +184,7 @@ class Lap:
 def laps(
     route: Matrix, vehicle: Vehicle, solids: Solids, *, duration_s: float, rng: np.random.Generator
 ) -> Motion:
-    """A drive round a closed ``route``: (W, 2) along the ground, (W, 3) walked upright at the heights it gives."""
+    """A drive around a closed ``route``: (W, 2) along the ground, (W, 3) walked upright at its heights."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     reach_m = vehicle.speed_m_s * duration_s + 10.0 * vehicle.corner_m + 2.0 * _MARGIN_S * vehicle.start_m_s
     line = _deviate(Lap(route).at(np.arange(0.0, reach_m, 0.02 * vehicle.corner_m)), vehicle, rng)
@@ -204,7 +204,7 @@ def laps(
 
 
 def begun_at(route: Matrix, start_m: float) -> Matrix:
-    """The closed route (W, d) from a point on, so many meters along it."""
+    """The closed route (W, d), starting ``start_m`` along it."""
     if start_m == 0.0:
         return route
     lap = Lap(route)
@@ -213,7 +213,7 @@ def begun_at(route: Matrix, start_m: float) -> Matrix:
 
 
 def sampled(route: Matrix, step_m: float) -> Matrix:
-    """Points along the straight segments of the closed route, both corners of each and one about every step."""
+    """Points along the straight segments of the closed route, both ends of each and about one point per step."""
     segments = zip(route, np.roll(route, -1, axis=0), strict=True)
     return np.vstack([np.linspace(a, b, max(int(np.linalg.norm(b - a) / step_m), 2)) for a, b in segments])
 
@@ -229,12 +229,12 @@ def _deviate(line: Matrix, vehicle: Vehicle, rng: np.random.Generator) -> Matrix
 
 
 def _drive(position: BSpline, arc_m: NDArray[np.float64], vehicle: Vehicle, duration_s: float) -> BSpline:
-    """Arc length over time: as fast as the limits allow, then eased so that the acceleration is continuous."""
+    """Arc length over time: as fast as the limits allow, smoothed so that the acceleration is continuous."""
     first, second = position(arc_m, 1), position(arc_m, 2)
     bend = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     energy = np.minimum(vehicle.speed_m_s**2, vehicle.lateral_acceleration_m_s2 / np.maximum(bend, 1e-9))
     energy[0] = vehicle.start_m_s**2
-    gain = 2.0 * vehicle.acceleration_m_s2 * arc_m  # v² grows by at most 2 a Δs, ahead and looking back
+    gain = 2.0 * vehicle.acceleration_m_s2 * arc_m  # v² grows by at most 2 a Δs, forward and backward
     energy = np.minimum.accumulate(energy - gain) + gain
     energy = (np.minimum.accumulate((energy + gain)[::-1]))[::-1] - gain
     speed = np.sqrt(np.maximum(energy, 0.0))
@@ -256,7 +256,7 @@ class Pivot(NamedTuple):
 def pivots(
     steps: tuple[Pivot, ...], vehicle: Vehicle, solids: Solids, *, duration_s: float, rng: np.random.Generator
 ) -> Motion:
-    """Turns and short moves from the origin, heading along x: ``steps`` that end as they began, repeated."""
+    """Turns and short moves from the origin, heading along x: ``steps`` that end in their first pose, repeated."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 5)
     turns = [_trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2) for step in steps]
     moves = [_trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2) for step in steps]

@@ -18,7 +18,7 @@ class Rays:
     """The rays of one scan, in the order they are fired.
 
     directions : (N, 3) unit vectors, sensor frame
-    instants_ns : (P,) int64, the firing instants after the scan's stamp, from 0 up
+    instants_ns : (P,) int64, the firing instants after the scan's stamp, starting at 0
     instant_of_ray : (N,) int32
     ring : (N,) uint16, 0 is the lowest; all 0 where there are no rings
     """
@@ -57,7 +57,7 @@ def _fired(azimuth: NDArray[np.float64], elevation: NDArray[np.float64], spacing
 
 
 def _planar(beams: int, step_deg: float, period_ns: int) -> Callable[[int], Rays]:
-    """One ring that turns counter-clockwise and looks ahead; its blind angle is behind."""
+    """One ring that turns counter-clockwise, centered ahead; its blind sector is behind."""
     azimuth = np.deg2rad(step_deg) * (np.arange(beams) - 0.5 * (beams - 1))
     rays = _fired(azimuth, np.zeros(beams), period_ns * step_deg / 360.0, beams)
     return lambda index: rays
@@ -71,9 +71,9 @@ def spinning(elevations_deg: NDArray[np.float64], columns: int, period_ns: int) 
 
 
 def _rosette(count: int, period_ns: int) -> Callable[[int], Rays]:
-    """Two wedges turning against each other draw a rosette that never repeats: other directions in every scan.
+    """Two counter-rotating wedge prisms scan a rosette that never repeats: the directions differ in every scan.
 
-    Half the field of view is 19.2°; the wedges turn at 7294 and −4664 rpm (Livox Mid-40: Brazeal et al. 2021).
+    Half the field of view is 19.2°; the prisms turn at 7294 and −4664 rpm (Livox Mid-40: Brazeal et al. 2021).
     """
 
     def rays(index: int) -> Rays:
@@ -101,14 +101,14 @@ SENSORS: dict[str, Sensor] = {
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """The rays of a scan and what came back: ``ranges_m`` (N,), inf where nothing did."""
+    """The rays of a scan and their ranges ``ranges_m`` (N,), inf without a return."""
 
     rays: Rays
     ranges_m: NDArray[np.float64]
 
     @property
     def returned(self) -> NDArray[np.bool_]:
-        """(N,) True for every ray that came back."""
+        """(N,) True for every ray with a return."""
         return np.isfinite(self.ranges_m)
 
     def points(self) -> RawPoints:
@@ -124,7 +124,7 @@ class Sweep:
 def take_sweep(
     solids: Solids, motion: Motion, sensor: Sensor, index: int, start_s: float, rng: np.random.Generator
 ) -> Sweep:
-    """Scan number ``index``, begun at ``start_s``: cast, then noise along the rays, losses and limits of range."""
+    """Scan number ``index``, started at ``start_s``: rays cast, noise along them, dropouts and range limits."""
     rays = sensor.rays(index)
     poses = motion.lidar(start_s + rays.instants_ns * 1e-9)
     ranges_m = solids.cast(poses, rays.instant_of_ray, rays.directions, sensor.max_range_m)

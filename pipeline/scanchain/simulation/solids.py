@@ -37,11 +37,11 @@ class Solids:
         return np.where(self.rows[:, :1] == ELLIPSOID, middle + radius * [-1.0, 1.0], self.rows[:, 7:])
 
     def part(self, chosen: NDArray[np.bool_]) -> Solids:
-        """Some of the solids, chosen by (S,)."""
+        """Some of the solids, selected by a mask (S,)."""
         return replace(self, rows=self.rows[chosen], owner=self.owner[chosen])
 
     def with_object(self, rows: Matrix, owner: int) -> Solids:
-        """These and those (N, 9) of one object, of that number."""
+        """These solids and those (N, 9) of one object with number ``owner``."""
         owners = np.append(self.owner, np.full(len(rows), owner))
         return replace(self, rows=np.vstack([self.rows, rows]), owner=owners)
 
@@ -62,7 +62,7 @@ class Solids:
     def cast(
         self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
     ) -> NDArray[np.float64]:
-        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3)."""
+        """Range to the first surface along each ray, inf beyond the limit; poses (P, 4, 4), directions (N, 3)."""
         ranges_m = np.empty(len(directions))
         origins = np.ascontiguousarray(T_world_sensor[:, :3, 3])
         rotations = np.ascontiguousarray(T_world_sensor[:, :3, :3])
@@ -99,8 +99,8 @@ class Solids:
         x_y, size, turn = self.rows[:, 1:3], self.rows[:, 3:5], self.rows[:, 5:7]
         center, half, ahead = (rows @ [1.0, 1.0j] for rows in (x_y - origins.mean(axis=0), size, turn))
         slack = np.linalg.norm(origins - origins.mean(axis=0), axis=1).max()
-        beside = center * ahead.conj()
-        outside = np.maximum(np.abs([beside.real, beside.imag]) - size.T, 0.0)
+        local = center * ahead.conj()  # in the solid's axes
+        outside = np.maximum(np.abs([local.real, local.imag]) - size.T, 0.0)
         nearest_m = np.maximum(np.hypot(*outside) - slack, 0.0)
         corners = center + ahead * np.array([half, half.conj(), -half, -half.conj()])
         grown = np.arcsin(np.minimum(slack / np.maximum(np.abs(corners), 1e-9), 1.0))
@@ -115,14 +115,14 @@ class Solids:
             dx, dy = xy[:, 0] - cx, xy[:, 1] - cy
             off_m = np.hypot(dx, dy) - max(half_x, half_y)
             if kind == BOX:
-                beside = np.abs([c * dx + s * dy, -s * dx + c * dy]) - [[half_x], [half_y]]
-                off_m = np.hypot(*np.maximum(beside, 0.0))
+                outside = np.abs([c * dx + s * dy, -s * dx + c * dy]) - [[half_x], [half_y]]
+                off_m = np.hypot(*np.maximum(outside, 0.0))
             nearest = np.minimum(nearest, off_m)
         return nearest
 
 
 class Scenery:
-    """A world under construction: solids are put down one by one and keep off what must stay free."""
+    """A world under construction: solids are added one by one."""
 
     def __init__(self, ground: NDArray[np.float64] = FLAT) -> None:
         self._ground = ground
@@ -133,27 +133,27 @@ class Scenery:
 
     @contextmanager
     def movable(self) -> Iterator[None]:
-        """A context: what is put down in it is one object, which may stand elsewhere another day."""
+        """A context: the solids added in it are one object, which may be elsewhere on another day."""
         self._owner = self._objects
         yield
         self._objects += 1
         self._owner = FIXED
 
     def box(self, center: Pair, size: Pair, z: Pair, yaw_rad: float = 0.0) -> None:
-        """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
+        """Add a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
         half, turn = (0.5 * size[0], 0.5 * size[1]), (np.cos(yaw_rad), np.sin(yaw_rad))
         self._put(BOX, center, half, turn, z)
 
     def cylinder(self, center: Pair, radius: float, z: Pair) -> None:
-        """Put down an upright cylinder, heights ``z`` above the ground at its center."""
+        """Add an upright cylinder, heights ``z`` above the ground at its center."""
         self._put(CYLINDER, center, (radius, radius), (1.0, 0.0), z)
 
     def ellipsoid(self, center: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
-        """Put down an ellipsoid; its center's height counts from the ground there."""
+        """Add an ellipsoid; its center's height is relative to the ground there."""
         self._put(ELLIPSOID, center[:2], radii[:2], (1.0, 0.0), (center[2], radii[2]))
 
     def finish(self) -> Solids:
-        """The solids put down so far."""
+        """The solids added so far."""
         return Solids(np.array(self._rows), np.array(self._owners), self._ground)
 
     def _put(self, kind: float, place: Pair, half: Pair, turn: Pair, z: Pair) -> None:

@@ -17,7 +17,7 @@ from scanchain.graph.consistency import FEWEST, carried, connected
 from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, Kind, Stretch, WheelCheck
 
 _LEAST_OVERLAP = 2.0 / 3.0  # smallest ``overlap`` that is no finding
-_GAP = 3.0  # intervals of usual length from which on the motion is not predicted
+_GAP = 3.0  # intervals of usual length above which the motion is not predicted
 _GAP_SCANS = 10  # longest gap within a stretch
 _PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
 _PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory

@@ -1,4 +1,4 @@
-"""An axis of a figure: its range, and as many ticks with round numbers as it has room for."""
+"""An axis of a figure: its range, and as many ticks at round numbers as fit."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 FONT = 8.0  # height of text in points
-_DIGIT = 0.64  # width of a digit, of the height of text
-_GAP = 4.0  # least distance between two numbers in points
-_MARGIN = 0.05  # of the range of the values, on both sides of them
+_DIGIT = 0.64  # width of a digit as a fraction of the text height
+_GAP = 4.0  # smallest gap between two numbers in points
+_MARGIN = 0.05  # margin on either side, as a fraction of the range of the values
 _MOST = 9  # largest number of intervals between ticks
 _ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)  # steps between ticks, times a power of ten
-_WITHIN_DECADES = ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))  # ticks of a logarithmic axis: the first that have room
+_WITHIN_DECADES = ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))  # ticks per decade: the first set that fits
 _TINY = 1e-9
 
 
@@ -23,7 +23,7 @@ def width_of(text: str) -> float:
 class Axis:
     """The range of what is drawn along one direction.
 
-    is_logarithmic : whether decades are equally long; only values above zero are drawn
+    is_logarithmic : whether the scale is logarithmic; only values above zero are drawn on it
     """
 
     def __init__(self, *, is_logarithmic: bool = False) -> None:
@@ -33,11 +33,11 @@ class Axis:
         self._limits: tuple[float, float] | None = None
 
     def limit(self, low: float, high: float) -> None:
-        """Set the range, downward or to the left where ``low`` is the greater."""
+        """Set the range; the axis is reversed if ``low`` is greater than ``high``."""
         self._limits = float(low), float(high)
 
     def include(self, values: NDArray[np.float64]) -> None:
-        """Widen the range by values, unless it is set; NaN have no place."""
+        """Widen the range to hold values, NaN excepted; without effect on a range that is set."""
         known = values[np.isfinite(values) & ((values > 0.0) | (not self.is_logarithmic))]
         self._least = float(known.min(initial=self._least))
         self._greatest = float(known.max(initial=self._greatest))
@@ -56,7 +56,7 @@ class Axis:
         return low - spare, high + spare
 
     def fractions(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Places of values along the axis, 0 at its first end, 1 at its last."""
+        """Positions of values along the axis, 0 at its first end, 1 at its last."""
         low, high = self.ends
         if self.is_logarithmic:
             values = np.log(np.where(values > 0.0, values, np.nan))
@@ -64,7 +64,7 @@ class Axis:
         return (values - low) / (high - low)
 
     def ticks(self, length: float, *, is_upright: bool) -> list[tuple[float, str]]:
-        """Fraction and number of each tick on an axis so many points long."""
+        """Fraction and label of each tick on an axis of this length in points."""
         low, high = min(self.ends), max(self.ends)
         values = self._decades(low, high, length, is_upright)
         texts = [f"{value:g}" for value in values]
@@ -75,7 +75,7 @@ class Axis:
         return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]
 
     def _decades(self, low: float, high: float, length: float, is_upright: bool) -> list[float]:
-        """Powers of ten, and between them what has room; none on a linear axis."""
+        """Powers of ten, and the ticks between them that fit; none on a linear axis."""
         if not self.is_logarithmic:
             return []
         exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
@@ -91,7 +91,7 @@ class Axis:
 
 
 def _round_steps(low: float, high: float, length: float, is_upright: bool) -> tuple[list[float], list[str]]:
-    """Multiples of the least round step whose numbers do not touch each other, and these numbers."""
+    """Multiples of the smallest round step whose labels do not overlap, and these labels."""
     most = int(np.clip(length / FONT / (2.0 if is_upright else 3.0), 1, _MOST))
     values: list[float] = []
     texts: list[str] = []

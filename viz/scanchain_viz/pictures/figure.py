@@ -1,6 +1,7 @@
-"""Figures: an SVG inside a page that takes its colors, light or dark, or by matplotlib a PNG file.
+"""Figures: SVG inside a page, in the page's light or dark colors, or a PNG file by matplotlib.
 
-The SVG of a report is written here: matplotlib takes half a second to load, and as long for a dozen figures.
+The SVG of a report is written without matplotlib, which takes half a second to load and as long again for a dozen
+figures.
 """
 
 from __future__ import annotations
@@ -29,15 +30,15 @@ INK, LINE = "var(--ink)", "var(--line)"  # the page's own colors
 THIN, DOTS = 0.8, (1.0, 1.5)  # width and dashes, in widths, of a dotted line
 DASHED = (3.0, 3.0)
 _INCH = 72.0  # points, the unit of the drawing
-_WIDTH, _WHOLE = 4.6, 9.6  # inches: of a figure beside another, and of one over the whole page, of equal text
+_WIDTH, _WHOLE = 4.6, 9.6  # inches: of a figure next to another, of one across the page; same text size
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
 _LOWEST, _HIGHEST, _HIGHEST_WHOLE = 1.5, 5.2, 6.5  # least and greatest heights of a plan in inches
-_TICK = 3.5  # length of a tick, and its distance to the number
-_ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # of text, over and under its baseline
-_LABEL = 4.0  # distance of a label to the numbers
-_SAME = 0.1  # points; successive positions of a line that are nearer are one
+_TICK = 3.5  # length of a tick, and its distance from the number
+_ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # height of text above and below its baseline
+_LABEL = 4.0  # distance of a label from the numbers
+_SAME = 0.1  # points; successive positions of a line that are closer are merged
 _FAR = 1e5  # points beyond which nothing is drawn
-_LEVEL = 3  # of compression: more is as long again and saves a tenth
+_LEVEL = 3  # PNG compression: a higher level takes twice as long and saves a tenth
 _FRAME = "#cccccc"  # of axes on white
 _PANEL_INCHES = (2.0, 12.0)  # least and greatest height of a figure in a PNG
 _TITLE_INCHES, _TITLE_FONT = 0.77, 11.0  # room for its title and labels, and the height of their text in points
@@ -59,13 +60,13 @@ class Line:
 
 
 class Plot:
-    """One figure with one pair of axes: draw in their units, then ask for the ``svg``, or ``write_png``.
+    """One figure with one pair of axes: draw in their units, then call ``svg`` or ``write_png``.
 
-    Only lines, marks and images are drawn in a PNG as well.
+    A PNG contains only its lines, marks and images.
 
-    logarithmic : the axis whose decades are equally long, "x" or "y"
+    logarithmic : the axis with a logarithmic scale, "x" or "y"
     height_inches : of the whole figure
-    is_wide : over the whole width of the page
+    is_wide : across the whole width of the page
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class Plot:
         return figure
 
     def _lay_out(self, *, is_wide: bool) -> None:
-        """Size of the figure, and corner and extent of its axes; of a plan so that a meter is equal along both."""
+        """Set the size of the figure, corner and extent of its axes; in a plan, their scales are equal."""
         size, (width, height) = np.array([_WHOLE if is_wide else _WIDTH, self.height_inches]), self.proportions
         if width:
             needed = (size[0] - _LEFT - _RIGHT) * height / width + _BOTTOM + _TOP
@@ -118,8 +119,8 @@ class Plot:
         """Draw a line through positions (N, 2) or, from above, (N, 3), broken where they are NaN.
 
         color : #rrggbb, or #rrggbbaa with its opacity
-        dashes : lengths of dashes and gaps in widths
-        name : in the legend of a PNG, once for all lines of this name
+        dashes : lengths of dashes and gaps in line widths
+        name : in the legend of a PNG; lines of the same name have one entry
         """
         x, y = self._included(positions)
         dashed = f"; stroke-dasharray: {' '.join(f'{width * each:.4g}' for each in dashes)}" if dashes else ""
@@ -138,10 +139,10 @@ class Plot:
         line: float = 0.0,
         name: str = "",
     ) -> None:
-        """Draw a mark of so many points at each position (N, 2): a disk "o", a square "s" or a cross "+".
+        """Draw a mark ``size`` points wide at each position (N, 2): a disk "o", a square "s" or a cross "+".
 
-        line : width of the line that it is drawn with; 0 fills it
-        name : as of a line
+        line : width of its outline; 0 fills it instead
+        name : as for ``line``
         """
         x, y = self._included(positions)
         half, style = 0.5 * size, f"stroke: {color}; stroke-width: {line:g}" if line else f"fill: {color}"
@@ -162,7 +163,7 @@ class Plot:
         self._on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
 
     def text(self, position: Floats, text: str) -> None:
-        """Write above and on the right of a position (2,)."""
+        """Write text above and to the right of a position (2,)."""
         x, y = self._included(position[None])
 
         def drawn() -> str:
@@ -180,7 +181,7 @@ class Plot:
         *,
         rendering: str = "pixelated",
     ) -> None:
-        """Draw an image (H, W) of numbers of colors between two corners, its first row at ``low``.
+        """Draw an image (H, W) of palette indices between two corners, its first row at ``low``.
 
         palette : (K, 4) red, green, blue, opacity
         rendering : "pixelated" to keep pixels apart, "auto" to blend them
@@ -227,12 +228,12 @@ class Plot:
         self._within.append(drawn)
 
     def svg(self) -> Markup:
-        """The figure as SVG for a page, a wide one once more for a narrow page; no text of a log is ever drawn."""
+        """The figure as SVG for a page, a wide one also in a narrow version; it never contains text from a log."""
         sizes = (("wide", True), ("narrow", False)) if self.is_wide else (("", False),)
         return Markup("".join(self._drawn(name, is_wide=is_wide) for name, is_wide in sizes))
 
     def draw_on(self, axes: Axes, title: str) -> None:
-        """Draw on axes of matplotlib, on white."""
+        """Draw on axes of matplotlib, with a white background."""
         for draw in self._on_axes:
             draw(axes)
         axes.set(xlim=self.x.ends, ylim=self.y.ends, aspect="equal" if self.proportions[0] else "auto")
@@ -262,15 +263,15 @@ class Plot:
             parts.append(_rule(left, y, f"h{-_TICK}", 0.8))
             parts.append(_text(left - 2.0 * _TICK, y + 0.5 * _ABOVE, text, "end"))
         below = bottom + 2.0 * _TICK + FONT + _LABEL + _ABOVE
-        beside = left - 2.0 * _TICK - max((width_of(text) for _, text in up), default=0.0) - _LABEL - _BELOW
+        aside = left - 2.0 * _TICK - max((width_of(text) for _, text in up), default=0.0) - _LABEL - _BELOW
         if self.x.label:
             parts.append(_text(left + 0.5 * width, below, self.x.label))
         if self.y.label:
-            parts.append(_text(beside, top + 0.5 * height, self.y.label, is_upright=True))
+            parts.append(_text(aside, top + 0.5 * height, self.y.label, is_upright=True))
         return "".join([*parts, "</svg>"])
 
     def _included(self, positions: NDArray[np.floating]) -> Floats:
-        """The columns x and y of positions, which widen the axes."""
+        """Columns x and y of positions; widens the axes to include them."""
         x, y = places = positions[:, :2].T.astype(np.float64)
         self.x.include(x)
         self.y.include(y)
@@ -293,7 +294,7 @@ def _text(x: float, y: float, text: str, anchor: str = "middle", *, is_upright: 
 
 
 def _path(points: Floats) -> str:
-    """Line through points (N, 2), broken where they are NaN."""
+    """SVG path through points (N, 2), broken where they are NaN."""
     known, cells = np.isfinite(points[:, 0] + points[:, 1]), np.rint(points / _SAME)
     begins, moves = known.copy(), np.ones(len(points), bool)
     begins[1:] &= ~known[:-1]
@@ -312,7 +313,7 @@ def broken(segments: NDArray[np.floating]) -> Floats:
 
 
 def around(points: NDArray[np.floating], share: float, least: float) -> tuple[Floats, Floats]:
-    """Corners (d,) of a view of the known of points (N, d): a margin of a share of their extent, or the least."""
+    """Corners (d,) around the finite points of (N, d), with a margin: ``share`` of their extent or ``least``."""
     known = points[np.isfinite(points).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
     margin = max(share * float((high - low).max()), least)
@@ -320,7 +321,7 @@ def around(points: NDArray[np.floating], share: float, least: float) -> tuple[Fl
 
 
 def write_png(path: Path, panels: Sequence[tuple[str, Plot]], *, width_inches: float) -> None:
-    """Write figures beside each other, each under its title, over one legend; the highest sets the height of all.
+    """Write figures side by side, each below its title, with one legend; the tallest sets the height of all.
 
     width_inches : of each
     Raises OSError.
@@ -342,5 +343,5 @@ def write_png(path: Path, panels: Sequence[tuple[str, Plot]], *, width_inches: f
 
 
 def _on_white(color: str) -> str:
-    """A color of the page as one on white."""
+    """The color on white that replaces a color of the page."""
     return "#1a1a1a" if color == INK else color

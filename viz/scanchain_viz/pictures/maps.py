@@ -1,4 +1,4 @@
-"""Maps seen from above with what lies on them: as pictures of a page, and of a run or a merge as a PNG file."""
+"""Maps seen from above with trajectories over them: as figures of a page, or as a PNG file of a run or a merge."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ Grid = tuple[NDArray[np.int8], float, tuple[float, float]]  # as ``read_map`` re
 
 GRAY = "#808893"  # of points of a map beneath lines
 _MAX_POINTS = 120_000
-_SAMPLE = 200_000  # points taken of a map's keyframes
-_PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
+_SAMPLE = 200_000  # points sampled from a map's keyframes
+_PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # width of a picture: per square root of its points; limits
 _SHADES, _HEIGHTS = 6, 36  # numbers of opacities and of colors of heights; a PNG has 256 colors
 VIRIDIS = (
     "440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c", "1fa088", "28ae80",
     "3fbc73", "5ec962", "84d44b", "addc30", "d8e219", "fde725",
 )  # fmt: skip
-_OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
-_BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point may lie outside of these
-_ALL_BUT_FEW, _MARGIN = (0.05, 99.95), 0.02  # percentiles that are shown, and the share of their range around them
-_PNG_INCHES, _PNG_MARGIN = 8.0, (0.04, 1.0)  # width; share of the extent and least meters
+_OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # number of points up to which each is opaque; range of opacities
+_BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; share of their range that a point may lie beyond
+_ALL_BUT_FEW, _MARGIN = (0.05, 99.95), 0.02  # percentiles shown; margin as a share of their range
+_PNG_INCHES, _PNG_MARGIN = 8.0, (0.04, 1.0)  # width; margin: share of the extent, least meters
 _NO_POINTS = np.empty((0, 3))
-_INKS = ("#a9b1bd", "#747c88", "#14171b")  # of points in space, by height
+_INKS = ("#a9b1bd", "#747c88", "#14171b")  # of 3D points, by height
 
 
 def surroundings(positions: NDArray[np.floating], clouds: Sequence[Points]) -> tuple[Floats, Floats]:
-    """Corners (3,) that hold positions (N, 3) and, but for outliers, the points of maps (M, 3) with a margin."""
+    """Corners (3,) around positions (N, 3) and, except for outliers, the points of maps (M, 3) with a margin."""
     boxes = np.array([extent(points) for points in clouds if len(points)]).reshape(-1, 2, 3)
     boxes += _MARGIN * np.ptp(boxes, axis=1, keepdims=True) * np.array([[-1.0], [1.0]])
     held = np.concatenate([positions, *boxes])
@@ -51,7 +51,7 @@ def surroundings(positions: NDArray[np.floating], clouds: Sequence[Points]) -> t
 
 
 def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Corners (d,) of a map (M, d), but for outliers along any axis: far beyond 99 % of all, and few."""
+    """Corners (d,) of a map (M, d) without outliers: few points, far outside of the middle 99 % along any axis."""
     low, high = np.percentile(points, _BULK, axis=0)
     size = high - low
     size[:2] = size[:2].max()
@@ -61,7 +61,7 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
 
 
 def map_points(prior: SavedMap) -> Points:
-    """(N, 3) some points of all keyframes of a map, in its frame."""
+    """(N, 3) points sampled from all keyframes of a map, in its frame."""
     each = max(_SAMPLE // max(len(prior.keyframes), 1), 1)
     clouds = [np.empty((0, 3))]
     for keyframe in prior.keyframes:
@@ -84,8 +84,8 @@ def over_map(
 ) -> Plot:
     """Lines over a map, seen from above, within corners.
 
-    points : (M, 3) of the map, in one color or, where they have heights, in several from low to high
-    path : (N, 3) its begin and end have outlines, circle and square, however short it is: it is drawn over them
+    points : (M, 3) of the map, in one color or, if they differ in height, in several from low to high
+    path : (N, 3) its start is outlined by a circle, its end by a square; a short path stays visible over them
     """
     figure = Plot.of_plan(low, high, is_wide=is_wide)
     if grid is not None:
@@ -102,9 +102,11 @@ def over_map(
 def draw_points(
     figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str], grain_m: float = 0.0
 ) -> None:
-    """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any.
+    """Draw points (M, 3) seen from above, within corners, in one color or, if they differ in height, in several.
 
-    A pixel, as large as their grains if known, has the color of its highest point and an opacity by their number.
+    A pixel has the color of its highest point and is more opaque the more points it has.
+
+    grain_m : distance of neighboring points and least edge of a pixel; 0 if unknown
     """
     points = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)]
@@ -161,7 +163,7 @@ def draw_map(
 ) -> None:
     """Draw lines over a map, all in the world frame, to a PNG; points (M, 3) of the map are shaded by height.
 
-    path : as of ``over_map``. Raises OSError.
+    path : as for ``over_map``. Raises OSError.
     """
     seen = points[:, :2]
     if grid is not None:
@@ -174,7 +176,7 @@ def draw_map(
 
 
 def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:
-    """Free white, occupied dark, unknown a light gray, like the paper around the grid."""
+    """Draw free cells white, occupied ones dark, unknown ones light gray like the area around the grid."""
     cells, resolution_m, origin_m = grid
     palette = np.vstack([palette_of((color,), 1) for color in ("#ffffff", "#262626", "#e6e6e6")])
     shades = np.where(cells < 0, 2, cells > 0).astype(np.uint8)
@@ -184,7 +186,7 @@ def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:
 
 
 def draw_evaluated(picture: Path, evaluated: Mapping[str, tuple[Matrix, Matrix]]) -> None:
-    """Draw estimates (N, 4, 4), aligned, over the true poses (N, 4, 4) beside them, those of the longest one."""
+    """Draw the aligned estimates (N, 4, 4) by name, and of the true poses (N, 4, 4) of each the longest."""
     truth = max((reference for _, reference in evaluated.values()), key=len)
     draw_map(picture, "Estimates and ground truth", [*_sessions(evaluated), _line("ground truth", truth, TRUTH)])
 
@@ -215,7 +217,7 @@ def draw_run(directory: Path, picture: Path) -> None:
             f"{directory}: holds no trajectory to draw; give the directory of a run, of localize or of merge, or "
             "open report.html"
         )
-    if "placed" in metrics:  # over the map that it was sought in
+    if "placed" in metrics:  # over the map that it was localized in
         points = map_points(open_saved_map(Path(metrics["map"])))
     else:
         points = read_ply(directory / "map.ply")
@@ -224,7 +226,7 @@ def draw_run(directory: Path, picture: Path) -> None:
     try:
         draw_map(picture, directory.resolve().name, lines, points=points, grid=grid, path=path)
     except OSError as error:
-        raise InputError(f"{picture}: not writable ({error.strerror}); choose another place") from error
+        raise InputError(f"{picture}: not writable ({error.strerror}); choose another path") from error
 
 
 def _lines_of_run(directory: Path, metrics: dict[str, Any]) -> tuple[list[Line], Floats]:
@@ -244,11 +246,11 @@ def _lines_of_run(directory: Path, metrics: dict[str, Any]) -> tuple[list[Line],
 
 
 def _sessions(poses: Mapping[str, Sequence[Matrix]]) -> list[Line]:
-    """A line through the first poses (N, 4, 4) of each name."""
+    """A line for each name, through the first of its arrays of poses (N, 4, 4)."""
     return [_line(name, each[0], color_of(place)) for place, (name, each) in enumerate(poses.items())]
 
 
 def _line(name: str, poses: Matrix, color: str, width: float = 1.4) -> Line:
-    """The line through poses (N, 4, 4), its length in the legend; that of the truth is dashed."""
+    """The line through poses (N, 4, 4), with its length in the legend; the ground truth is dashed."""
     length_m = path_length(poses)[-1]
     return Line(f"{name} ({length_m:.0f} m)", poses[:, :3, 3], color, width, is_dashed=color == TRUTH)

@@ -1,4 +1,4 @@
-"""Trajectories with figures of their scans, from the tables of a run or of a comparison."""
+"""Trajectories with values for each scan, from the tables of a run or of a comparison."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _MARGIN, _MARGIN_Z = (0.08, 1.0), (0.25, 0.1)  # shares of the extent and least 
 
 @dataclass(frozen=True, slots=True)
 class DrawnTrajectory:
-    """A trajectory to draw, with figures of its N scans; unknown ones are NaN.
+    """A trajectory to draw, with values for each of its N scans; unknown ones are NaN.
 
     name : for legends outside the drawings
     color, is_dashed : how its line is drawn
     positions : (N, 3) meters, in one frame with the other trajectories
     distance_m : (N,) traveled
     error_m : (N,) distance from the true position
-    relation_error_m : (K,) the same of K relations, none where there are no relations
-    seconds : (N,) what each scan took
-    nees : (N,) squared error over covariance, 1 on average if exact
+    relation_error_m : (K,) error of each of K manually verified relations; empty if there are none
+    seconds : (N,) processing time of each scan
+    nees : (N,) squared error normalized by its covariance, 1 on average if the covariance is exact
     observability : (N,) information along the least constrained direction over the required minimum
     """
 
@@ -60,9 +60,10 @@ def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> Floa
 def trajectories_of_run(
     steps: pa.Table, truth: Trajectory | None, gap_s: float | None
 ) -> tuple[list[DrawnTrajectory], Floats | None]:
-    """Both trajectories and the (K, 3) true positions at scans that have one, in the frame of the map.
+    """Optimized and odometry trajectories and (K, 3) true positions of the scans that have one, in the map frame.
 
-    Errors are NaN where a scan has no true pose. More true positions would lengthen the path by their noise.
+    Errors are NaN where a scan has no true pose. Other true positions are left out: their noise would lengthen the
+    path.
     """
     optimized, odometry = (
         Trajectory(steps["stamp_ns"].to_numpy(), poses_of(steps, prefix=prefix)) for prefix in ("", "odom_")
@@ -91,7 +92,7 @@ def trajectories_of_run(
 
 
 def trajectories_of_comparison(directory: Path) -> list[DrawnTrajectory]:
-    """Trajectory of each method that began, in the order of the table, of its longest run."""
+    """Trajectory of the longest run of each method that started, in the order of the table."""
     scans, file = pq.read_table(directory / SCANS_FILE), directory / RELATIONS_FILE
     relations = pq.read_table(file) if file.exists() else None
     rows = enumerate(read_table(directory).rows)
@@ -100,7 +101,7 @@ def trajectories_of_comparison(directory: Path) -> list[DrawnTrajectory]:
 
 
 def _of_method(row: Row, color: str, scans: pa.Table, relations: pa.Table | None) -> DrawnTrajectory:
-    """Of several runs the one with most scans, the first of those."""
+    """Trajectory of the method's run with the most scans, of the first one if several have as many."""
     is_of_it = pc.field("method") == row.name
     runs = scans.filter(is_of_it)
     if len(runs):

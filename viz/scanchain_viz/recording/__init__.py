@@ -2,5 +2,5 @@
 
 import os
 
-# errors of writing are our own warnings; the library's own lines on it would come in between, in color
+# writing errors become warnings of the run; rerun's own colored log lines would only clutter the output
 os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=off")

@@ -1,4 +1,4 @@
-"""Steps gathered into batches, one call a column instead of one a scan, and the keyframe graph as it grows."""
+"""Batches of steps, logged with one call per column instead of one per scan, and the growing keyframe graph."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from scanchain_viz.recording.drawing import Floats, Message, Times
 _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000
 _MAX_WAIT_S = 0.25
-_LEAST_DRAWN = 1e-3  # least observability that is drawn
-WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
-_GROWTH = 1.05  # factor of growth between two drawings: the recording stays linear in the length of the log
+_LEAST_DRAWN = 1e-3  # smaller observability is drawn as this
+WARNING, _INFORMATION = "WARN", "INFO"  # rerun's log levels
+_GROWTH = 1.05  # growth factor between two drawings: the recording's size stays linear in the log's length
 _DOWNWEIGHTED = 0.5  # robust weight below which an accepted closure is drawn amber
 
 
 class KeyframeGraph:
-    """Takes in every step; returns the news of closures, and draws the graph when it has grown enough."""
+    """Keyframe graph of the steps so far: reports new verdicts on closures, is drawn when it has grown enough."""
 
     def __init__(self) -> None:
         self.positions: list[Floats] = []
@@ -36,10 +36,10 @@ class KeyframeGraph:
         self.closures: list[Closure] = []
         self.graph: GraphState | None = None
         self.counts = (0, 0)  # of closures accepted and rejected
-        self.drawn = 0  # number of keyframes that it had when it was drawn
+        self.drawn = 0  # number of keyframes when it was last drawn
 
     def add(self, step: Step) -> list[str]:
-        """Take in a step; the verdicts on its closures are those of the matcher, then of the back end for all."""
+        """Add a step; returns new verdicts on closures: the matcher's on its own, then the back end's on all."""
         if step.keyframe >= 0:
             self.positions.append(drawing.positions(step.T_world_lidar[None])[0])
         news: list[str] = []
@@ -52,7 +52,7 @@ class KeyframeGraph:
         return news
 
     def settle(self, closures: Sequence[Closure], graph: GraphState) -> list[str]:
-        """Take in the final graph with every closure tried."""
+        """Set the final graph and all closures tried; returns the verdicts that changed."""
         self.graph, self.drawn = graph, 0
         return self._update(closures)
 
@@ -70,7 +70,7 @@ class KeyframeGraph:
         return len(self.positions) > _GROWTH * self.drawn
 
     def draw(self, times: Times) -> list[Message]:
-        """Messages of the present graph, unless it is drawn already."""
+        """Messages that draw the current graph; none if it is already drawn."""
         if self.drawn == len(self.positions):
             return []
         self.drawn = len(self.positions)
@@ -95,7 +95,7 @@ class KeyframeGraph:
         return [item for item in self.closures if item.verdict is verdict]
 
     def _update(self, closures: Sequence[Closure]) -> list[str]:
-        """Store the verdicts; a line for each new one, the number being the closure's row in loops.parquet."""
+        """Store the verdicts; returns a line for each new one, numbered by the closure's row in loops.parquet."""
         before = [item.verdict for item in self.closures]
         self.closures = list(closures)
         self.counts = len(self._of(ClosureVerdict.ACCEPTED)), len(self._of(ClosureVerdict.REJECTED))
@@ -107,7 +107,7 @@ class KeyframeGraph:
 
 
 class Batcher:
-    """Holds the steps since the last batch; every batch turns them into messages."""
+    """Collects steps, and turns each batch of them into messages."""
 
     def __init__(self, config: RecordingConfig) -> None:
         self.config = config
@@ -118,7 +118,7 @@ class Batcher:
         self.box: Floats | None = None
         self.started_s = perf_counter()
         self.now = Times.at(0, 0)  # of the last step
-        self.last: Matrix | None = None  # (1, d+1, d+1) T_odom_lidar of the scan before
+        self.last: Matrix | None = None  # (1, d+1, d+1) T_odom_lidar of the previous scan
         self.state: State | None = None
 
     def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> None:
@@ -133,7 +133,7 @@ class Batcher:
         self.state = steps.last_state
 
     def add(self, step: Step) -> list[Message]:
-        """Take in one step, and the verdicts of that moment; the messages that are due after it."""
+        """Add a step with the verdicts at that time; returns the messages that are due."""
         self.now = Times.at(step.scan.index, step.scan.stamp_ns)
         news = self.graph.add(step)
         if not self.gathered:
@@ -174,21 +174,21 @@ class Batcher:
         ]
 
     def settled(self, closures: Sequence[Closure], graph: GraphState) -> list[Message]:
-        """All that is left, and the final verdicts, at the last step."""
+        """Messages of the remaining steps, and of the final verdicts at the last step."""
         messages, news = self.messages(), self.graph.settle(closures, graph)
-        told = events([[(_INFORMATION, text) for text in news]], self.now)
-        return [*messages, *told, _counts([self.graph.counts], self.now), *self.graph.draw(self.now)]
+        reported = events([[(_INFORMATION, text) for text in news]], self.now)
+        return [*messages, *reported, _counts([self.graph.counts], self.now), *self.graph.draw(self.now)]
 
     def _frame(self, positions: Floats) -> None:
-        """Widen the box around everything that was passed, (2, 3)."""
+        """Widen the bounding box (2, 3) of the trajectory."""
         known = positions if self.box is None else np.concatenate([self.box, positions])
         self.box = np.stack([known.min(axis=0), known.max(axis=0)])
 
     def _trails(self, times: Times, odom: Matrix, world: Matrix) -> Iterator[Message]:
         """Each scan's segment of the trajectory, before and after correction, and the correction.
 
-        A segment of the corrected trajectory starts where the scan before stands under the same correction, so
-        that a closure does not draw a jump.
+        A segment of the corrected trajectory starts at the previous scan's pose under the same correction,
+        so that a closure does not draw a jump.
         """
         before = np.concatenate([odom[:1] if self.last is None else self.last, odom[:-1]])
         self.last, corrections = odom[-1:], world @ lie.inverse(odom)
@@ -201,15 +201,15 @@ class Batcher:
             yield Message(entity, rr.LineStrips3D.columns(strips=strips), times)
 
     def _states(self, steps: Sequence[Step], news: Sequence[list[str]], times: Times) -> Iterator[Message]:
-        """The state where it changes, with the reason as an event, and the news of loop closures."""
+        """The state where it changes, with the reason as an event, and new verdicts on loop closures as events."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
         self.state = steps[-1].state
-        told: list[list[tuple[str, str]]] = []
+        reported: list[list[tuple[str, str]]] = []
         for step, is_new, texts in zip(steps, changed, news, strict=True):
             why = [(WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
-            told.append([*why, *((_INFORMATION, text) for text in texts)])
-        yield from events(told, times)
+            reported.append([*why, *((_INFORMATION, text) for text in texts)])
+        yield from events(reported, times)
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
             yield Message(entities.STATE, rr.StateChange.columns(state=states), times[changed])
@@ -230,7 +230,7 @@ def _counts(counts: Sequence[tuple[int, int]], times: Times) -> Message:
 
 
 def _plots(steps: Sequence[Step], times: Times) -> Iterator[Message]:
-    """Figures and covariance of the registrations, what is infinite is a gap, and times of the stages."""
+    """Values of the registrations, with gaps where one is infinite, their covariances, and times of the stages."""
     matches = [step.match for step in steps]
     figures = {
         entities.INLIERS: [match.inliers for match in matches],

@@ -1,6 +1,6 @@
-"""Messages: what is drawn at an entity, for every sink of a recording, and arrays as rerun draws them.
+"""Messages to the sinks of a recording, and conversions of arrays to what rerun draws.
 
-The pipeline has SE(2) or SE(3) in float64; rerun draws float32 in space, a 2D log in the plane z = 0.
+The pipeline has SE(2) or SE(3) in float64; rerun draws float32 in 3D, a 2D log in the plane z = 0.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Floats = NDArray[np.float32]
 Color = tuple[int, int, int]
 Colors = Color | Sequence[Color] | NDArray[np.uint8]
 
-_WEAKEST = 25.0  # m⁻²: a standard deviation above 0.2 m, or none at all, is drawn as 0.2 m
+_WEAKEST = 25.0  # m⁻²: a standard deviation above 0.2 m, or an infinite one, is drawn as 0.2 m
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +50,14 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Columns of an entity over ``times``, or an archetype at one instant; without times it holds for ever."""
+    """Columns of an entity over ``times``, or an archetype at one instant; without times it is static."""
 
     entity: str
     content: rr.AsComponents | rr.ComponentColumnList
     times: Times | None = None
 
     def send(self, stream: rr.RecordingStream) -> None:
-        """Write it to a stream; raises where rerun refuses it."""
+        """Write it to a stream; raises if rerun rejects it."""
         if self.times is None:
             assert isinstance(self.content, rr.AsComponents)
             stream.log(self.entity, self.content, static=True, strict=True)
@@ -70,19 +70,19 @@ class Message:
 
 
 def pixels(radius: float | None) -> float | None:
-    """A radius in points of the screen, which rerun takes as a negative number."""
+    """A radius in UI points, which rerun encodes as a negative number."""
     return None if radius is None else -radius
 
 
 def dots(positions: Floats | None = None, color: Colors | None = None, radius: float | None = None) -> rr.Points3D:
-    """Points (N, 3) of one radius on the screen, of one color or one each; what is None keeps its static value."""
+    """Points (N, 3) of one radius in UI points, in one color or one each; None keeps the static value."""
     return rr.Points3D.from_fields(positions=positions, colors=color, radii=pixels(radius))
 
 
 def lines(
     strips: Sequence[Floats] | Floats | None = None, color: Colors | None = None, radius: float | None = None
 ) -> rr.LineStrips3D:
-    """Line strips, (N, 3) each, of one radius on the screen, of one color or one each; None as in ``dots``."""
+    """Line strips, (N, 3) each, of one radius in UI points, in one color or one each; None as in ``dots``."""
     return rr.LineStrips3D.from_fields(strips=strips, colors=color, radii=pixels(radius))
 
 
@@ -106,7 +106,7 @@ def ellipsoids(informations: Matrix, scale: float) -> rr.ComponentColumnList:
     """Ellipsoid columns of the position's covariance, axes ``scale`` standard deviations long.
 
     informations : (N, k, k) of twists in the lidar's frame, so that the translation block of the inverse is the
-        covariance of the position along the lidar's axes. What is not determined is drawn at the cap.
+        covariance of the position along the lidar's axes. Unobservable directions are drawn at the cap.
     """
     k = informations.shape[-1]
     d = 2 if k == 3 else 3

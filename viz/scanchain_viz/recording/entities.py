@@ -65,25 +65,25 @@ CYAN, PALE_GREEN = (70, 210, 210), (190, 240, 160)
 
 _HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
 
-_BACKGROUND = (13, 16, 17)  # of scenes, also where the viewer is light: lines of ground truth are white
+_BACKGROUND = (13, 16, 17)  # of scenes, also in a light viewer: lines of ground truth are white
 _PLAY_S = 30.0
-_ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels
+_ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, except in the first scans, which load the kernels
 
-# a list, since the viewer wraps its lines; those of a table it cuts off
+# a list, since the viewer wraps its lines but cuts off those of a table
 _LEGEND = f"""
 - **yellow points**: the scan, deskewed and downsampled, as it was matched
 - **gray points**: the local map it was matched against
 - **orange line**: trajectory by odometry alone; smooth, drifts
-- **blue line**: trajectory as known at the time, every scan placed by the closures known then
+- **blue line**: trajectory as estimated at the time of each scan, with the closures known then
 - **cyan line**: trajectory after the last optimization, over all scans
 - **white line**: ground truth, aligned to the optimized trajectory as for the ATE
 - **violet dots, gray edges**: keyframes and the odometry between them
 - **green edges**: accepted loop closures; pale where the back end lowered their weight below ½
 - **red edges**: loop closures that the matcher or, later, the back end rejected
 - **thick lines**: stretches to check, listed in the verdict and in the events
-- **violet ellipsoid**: standard deviation of the position by the matcher, {COVARIANCE_SCALE:.0f} times as large
+- **violet ellipsoid**: the matcher's standard deviation of the position, enlarged {COVARIANCE_SCALE:.0f} times
 
-**Observability** is the information along the least constrained direction over the least that is required: below 1
+**Observability** is the information along the least constrained direction over the minimum required: below 1
 (log10 below 0) a scan is degenerate.
 
 **Timelines**: `scan` counts the scans in the order of the log, `sensor_time` is the header stamp, which may step
@@ -118,7 +118,7 @@ def constants(dimension: int) -> list[Message]:
         Message(ACCEPTED, lines(radius=1.5)),
         Message(REJECTED, lines(color=RED, radius=0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
-        Message(VERDICT, rr.TextDocument("The verdict comes with the end of the run.")),
+        Message(VERDICT, rr.TextDocument("The verdict is available at the end of the run.")),
         Message(TIME, stages),
         *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in SERIES.items()),
         Message(LOOPS, rr.SeriesLines(names=["accepted", "rejected"], colors=[GREEN, RED])),
@@ -130,7 +130,7 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
     """The layout of a 2D log (seen from above) or a 3D one.
 
     box : (2, 3) lowest and highest coordinates that the view should frame
-    scans : how many there are, where that is known: they are played in half a minute, but no slower than 30 Hz
+    scans : their number, 0 if unknown; they are played in half a minute, but no slower than 30 Hz
     """
     hidden, whole = rrb.PlotLegend(visible=False), whole_log()
     observability, residual, *others = (
@@ -156,7 +156,7 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
 
 
 def with_panels(root: rrb.Container | rrb.View, *, scans: int = 0, has_toggles: bool = False) -> rrb.Blueprint:
-    """Views with collapsed panels around them, but for the list of entities where they are there to toggle."""
+    """Views with collapsed panels around them; with ``has_toggles`` the list of entities is expanded."""
     return rrb.Blueprint(
         root,
         rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S)),
@@ -166,7 +166,7 @@ def with_panels(root: rrb.Container | rrb.View, *, scans: int = 0, has_toggles: 
 
 
 def whole_log() -> rrb.TimeAxis:
-    """From the first scan to the last."""
+    """Time axis from the first scan to the last."""
     return rrb.TimeAxis(
         view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
     )
@@ -183,9 +183,9 @@ def up_to_now() -> rrb.VisibleTimeRanges:
 def scene(
     name: str, dimension: int, seen: NDArray[np.floating] | None, overrides: Mapping[Any, Any] | None = None
 ) -> rrb.Spatial3DView:
-    """The world, dark whatever the viewer is: from above for a 2D log, obliquely for a 3D one.
+    """View of the world on a dark background: from above for a 2D log, obliquely for a 3D one.
 
-    seen : (N, 3) points, or corners, that the view should hold
+    seen : (N, 3) points, or corners, that the view should contain
     """
     known = np.array([[-20.0] * 3, [20.0] * 3]) if seen is None or not len(seen) else seen
     low, high = known.min(axis=0), known.max(axis=0)

@@ -1,6 +1,6 @@
 """The rerun recording of a run, to a file, to a viewer, or to both.
 
-Nothing that goes wrong here after the start ends a run; it is collected in ``Recording.warnings``.
+An error here after the start does not end the run; it is collected in ``Recording.warnings``.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import Sink, file_sink, is_readable, open_stream, send_layout, viewer_sink
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
-_RADIUS = 3.5  # of a stretch, in points of the screen
+_RADIUS = 3.5  # of a stretch's line, in UI points
 
 
 @dataclass(eq=False)
 class Recording:
-    """Takes in steps and results; a context that is entered before the first and left after the last.
+    """Recording of steps and results; a context manager, entered before the first and left after the last.
 
     path : the .rrd file; needed for the sink "save", ignored otherwise
-    name : what the viewer calls the recording
+    name : of the recording in the viewer
     sinks : "save" to the file, "spawn" a viewer, "connect" to an open one, serve a "web" viewer on this machine;
-        none at all is a recording that goes nowhere
+        without any, nothing is recorded
     """
 
     path: Path | None
@@ -86,7 +86,7 @@ class Recording:
 
     @property
     def warnings(self) -> list[str]:
-        """Problems so far, a line each."""
+        """Problems so far, one line each."""
         return [*self.problems, *(warning for sink in self.opened for warning in sink.warnings)]
 
     def resume(
@@ -108,7 +108,7 @@ class Recording:
             sink.settle()
 
     def secure(self) -> int:
-        """Size of the file in bytes, once it holds all that was recorded; 0 where there is no whole one."""
+        """Size of the file in bytes, after everything so far is written to it; 0 if there is no complete file."""
         self._send(self.batcher.messages)
         if self.path is None or self.file is None or not self.file.settle():
             return 0
@@ -145,13 +145,13 @@ class Recording:
     def log_grid(self, cells: NDArray[np.int8], *, resolution_m: float, origin_m: tuple[float, float]) -> None:
         """Record the finished occupancy grid of a 2D log.
 
-        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 unknown; row 0 at the lowest y
+        cells : (H, W), as in ROS: 0 free to 100 occupied, −1 unknown; row 0 at the lowest y
         origin_m : x, y of the outer corner of cells[0, 0]
         """
         self._send(lambda: [Message(entities.GRID, _grid(cells, resolution_m, origin_m))])
 
     def hold(self) -> None:
-        """Keep the web viewer served until it ends or the user interrupts."""
+        """Serve the web viewer until it ends or the user interrupts."""
         self._send(self.batcher.messages)
         if self.server is not None:
             with suppress(KeyboardInterrupt):
@@ -175,7 +175,7 @@ class Recording:
         return viewer.grpc_address()
 
     def _map(self, points: NDArray[np.floating]) -> list[Message]:
-        """The map's points as far as they are drawn."""
+        """Message with the map's points, downsampled to as many as are drawn."""
         drawn = drawing.at_most(points, max(self.config.max_map_points, self.batcher.points // 3))
         if not len(drawn):
             return []
@@ -233,7 +233,7 @@ def _verdict(judged: Judged, trajectory: Trajectory) -> Iterator[Message]:
     if not judged.stretches:
         return
     path = drawing.positions(trajectory.poses)
-    strips = [  # of disagreeing loops the line between their ends
+    strips = [  # for disagreeing loops, the line between their ends
         path[[each.first, each.last]] if each.kind is Kind.LOOPS else path[max(each.first - 1, 0) : each.last + 1]
         for each in judged.stretches
     ]

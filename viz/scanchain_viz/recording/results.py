@@ -1,6 +1,6 @@
 """Pages and recordings of complete results: comparisons, maps, localized logs; recordings of graphs and landmarks.
 
-Each .rrd file is written whole or not at all; OSError is raised.
+Each .rrd file is written completely or not at all. Raises OSError.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from scanchain_viz.recording.sinks import write_recording
 from scanchain_viz.report import comparison, maps, problems
 
 _MAP_POINTS = 300_000
-_COMPARED_POINTS = 60_000  # of the map of a method
+_COMPARED_POINTS = 60_000  # of each method's map
 _HEADROOM = 1.2  # factor over the 99th percentile at which a plot ends
 _PLOTS = (  # name, title, field of a trajectory, factor to the unit
     ("error", "position error [m]", "error_m", 1.0),
-    ("time", "time of a scan [ms]", "seconds", 1e3),
+    ("time", "time per scan [ms]", "seconds", 1e3),
 )
-_BOX_M, _ELLIPSE_M = 0.02, 1e-4  # heights of what is flat
+_BOX_M, _ELLIPSE_M = 0.02, 1e-4  # heights of 2D boxes and of ellipses
 _RADII = {Label.SAME: 0.75, Label.UNKNOWN: 1.0, Label.APPEARED: 2.0, Label.VANISHED: 2.0}
 _FINAL, _SIGMA = "world/final", "plots/sigma"
 _MATCHED, _UNMATCHED = "world/matches/accepted", "world/matches/rejected"
@@ -133,7 +133,7 @@ def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
 
 
 def present_changes(directory: Path, changes: Changes) -> None:
-    """Write report.html and recording.rrd beside summary.txt: points by label, boxes around clusters, arrows."""
+    """Write report.html and recording.rrd next to summary.txt: points by label, boxes around clusters, arrows."""
     maps.write_changes_report(directory, changes)
     world = scene("changes", changes.dimension, drawing.in_space(changes.points))
     text = rrb.TextDocumentView(origin="summary", name="summary")
@@ -172,7 +172,7 @@ def _centers(changes: Changes, numbers: Sequence[int]) -> drawing.Floats:
 
 
 def _upright(angles_rad: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions x, y, z, w (N, 4) of turns about z."""
+    """Quaternions x, y, z, w (N, 4) of rotations about z."""
     half, zeros = 0.5 * np.asarray(angles_rad), np.zeros(len(angles_rad))
     return np.stack([zeros, zeros, np.sin(half), np.cos(half)], axis=1)
 
@@ -203,7 +203,7 @@ def present_localization(directory: Path, localized: LocalizedLog) -> None:
 
 
 def _localized(localized: LocalizedLog) -> Iterator[Message]:
-    """States, poses as known at the time of each scan, keyframes from when their place is known, and matches."""
+    """States, poses as estimated at the time of each scan, keyframes localized by then, and matches."""
     found, keyframes = localized.localization, localized.localization.result.keyframes
     stamps_ns = found.trajectory.stamps_ns
     times = Times(np.arange(len(stamps_ns), dtype=np.int64), stamps_ns)
@@ -255,7 +255,7 @@ def _graph(state: GraphState, when: int) -> Iterator[Message]:
 def record_landmarks(studies: Sequence[Study], path: Path) -> None:
     """Write a view of each landmark problem; ``scan`` is 0 before optimization and 1 after.
 
-    All is in the frame of the truth where there is one; landmarks after optimization carry their 95 % ellipses.
+    All is in the frame of the ground truth if there is one; landmarks after optimization have 95 % ellipses.
     """
     roots = {f"{entities.WORLD}/{file_stem(study.name)}": study for study in studies}
     views = [rrb.Spatial3DView(origin=root, name=study.name) for root, study in roots.items()]
@@ -265,7 +265,7 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
 
 
 def _study(root: str, study: Study) -> Iterator[Message]:
-    """The true trajectory and landmarks for ever, the estimates at their instants."""
+    """The true trajectory and landmarks, static, and the estimates at their instants."""
     known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
     path = drawing.lines([drawing.in_space(study.true_poses)], entities.GRAY, 1.0)
     yield Message(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP)

@@ -1,8 +1,8 @@
 """Destinations of a recording: a file, a live viewer, or both; each is a stream served by its own thread.
 
 rerun can tee one stream to both, but it waits without a limit for a viewer that stops reading (a suspended laptop,
-a broken tunnel) and for a file on a full disk, and the run would wait with it. Here the run waits for a queue, and
-for that only so long.
+a broken tunnel) and for a file on a full disk, and would block the run. Here the run waits only for a queue, with
+a timeout.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ _COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is co
 _LOOK_EVERY_S = 0.1
 _FILE_PATIENCE_S = 10.0
 _VIEWER_PATIENCE_S = 5.0
-_READ_S, _READ_MIB, _READ_TIMES = 60.0, 1024.0, 50.0  # largest time and memory to read one, and times its size
-_open: set[rr.RecordingStream] = set()  # those that were not closed in good order (yet)
+_READ_S, _READ_MIB, _READ_TIMES = 60.0, 1024.0, 50.0  # limits of reading: s, MiB, MiB per MiB of its size
+_open: set[rr.RecordingStream] = set()  # those that are open or were not closed cleanly
 
 
 @dataclass(eq=False)
 class Sink:
     """Passes batches on to one stream.
 
-    name : what warnings call it
-    connect : run first, in the thread
-    patience_s : how long it may take nothing before it is given up
-    is_lossless : whether the run waits for it when it falls behind; else what it is too slow for is dropped
+    name : in warnings
+    connect : called first, in the thread
+    patience_s : timeout after which a sink that accepts no data is abandoned
+    is_lossless : whether the run waits for it when it falls behind; otherwise batches are dropped
     """
 
     name: str
@@ -69,7 +69,7 @@ class Sink:
         self.thread.start()
 
     def send(self, write: Callable[[rr.RecordingStream], object]) -> None:
-        """Have the thread write to the stream; what goes wrong ends up in ``warnings``."""
+        """Have the thread write to the stream; errors are added to ``warnings``."""
         if self.warnings:
             return
         try:
@@ -77,7 +77,7 @@ class Sink:
         except queue.Full:
             self.dropped += 1
             if self.is_lossless:
-                self._give_up("it takes no more data")
+                self._abandon("it accepts no more data")
 
     def settle(self) -> bool:
         """Wait until everything is written; True if it is."""
@@ -90,17 +90,17 @@ class Sink:
                 if flushes != self.flushes:
                     flushes, since_s = self.flushes, perf_counter()
                 elif perf_counter() - since_s > self.patience_s:
-                    self._give_up("it takes no more data")
+                    self._abandon("it accepts no more data")
         return not self.warnings
 
     def close(self) -> None:
-        """Give it time to take the rest, then go on without it."""
+        """Wait for the rest to be written, up to the timeout, then continue without this sink."""
         if not self.warnings:
             with contextlib.suppress(queue.Full):
                 self.waiting.put(None, timeout=self.patience_s)
             self.thread.join(self.patience_s + 1.0)
             if self.thread.is_alive():
-                self._give_up("it takes no more data")
+                self._abandon("it accepts no more data")
         if self.dropped and not self.warnings:
             self.warnings.append(f"{self.name} was too slow: it lacks {counted(self.dropped, 'batch', 'batches')}")
 
@@ -113,10 +113,10 @@ class Sink:
             self.stream.disconnect()
             _open.discard(self.stream)
         except Exception as error:
-            self._give_up(str(error))
+            self._abandon(str(error))
 
     def copy(self, path: Path, stream: rr.RecordingStream) -> None:
-        """Write, in the thread, what a recording holds, except its static messages, which are sent again."""
+        """Write a recording's data, in the thread, except its static messages, which are sent again."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RerunWarning)  # what a killed process wrote lacks rerun's index
             chunks = RrdReader(path).stream().filter(is_static=False)
@@ -129,8 +129,8 @@ class Sink:
         self.stream.flush(timeout_sec=self.patience_s)
         self.flushes += 1
 
-    def _give_up(self, why: str) -> None:
-        """Warn, and never free the stream: freeing it, like rerun's exit handler, may wait without a limit."""
+    def _abandon(self, why: str) -> None:
+        """Warn, and never free the stream: freeing it, like rerun's exit handler, may block forever."""
         with self.lock:
             if self.warnings:
                 return
@@ -140,7 +140,7 @@ class Sink:
 
 
 def is_readable(path: Path) -> bool:
-    """Whether a recording can be read, tried in a process of its own: rerun aborts on sizes that are damaged."""
+    """True if a recording can be read; tried in a separate process, since rerun aborts on damaged sizes."""
     size_mib = path.stat().st_size / 2**20
     limits = Limits(_READ_S + size_mib, min(_READ_MIB + _READ_TIMES * size_mib, available_mib()))
     with TemporaryDirectory(prefix="scanchain-") as folder:
@@ -150,10 +150,11 @@ def is_readable(path: Path) -> bool:
 
 
 def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -> rr.RecordingStream:
-    """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout.
+    """A stream with the recording's name and without rerun's log_time; each ``kind`` has its own layout.
 
-    rerun keeps two threads for each stream that was closed until it is told to free those without an owner, as
-    ``rr.init`` does. That waits for streams that take nothing more, and ends a recording that the user began.
+    rerun keeps two threads for each closed stream until streams without an owner are freed, as by ``rr.init``.
+    Freeing waits for streams that accept no more data, and ends a recording that the user started: it is skipped
+    if there is either.
     """
     if not _open and rr.get_global_data_recording() is None:
         bindings.flush_and_cleanup_orphaned_recordings()
@@ -166,7 +167,7 @@ def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -
 
 
 def send_layout(stream: rr.RecordingStream, blueprint: rrb.Blueprint, *, is_active: bool) -> None:
-    """Send a layout by a stream that is closed; that of ``rr.send_blueprint`` stays open with its two threads."""
+    """Send a layout by a stream that is then closed; ``rr.send_blueprint`` leaves one open, with two threads."""
     application = stream.get_application_id() or ""
     layout = rr.RecordingStream._from_native(
         bindings.new_blueprint(application, make_default=False, make_thread_default=False, default_enabled=True)
@@ -181,7 +182,7 @@ def send_layout(stream: rr.RecordingStream, blueprint: rrb.Blueprint, *, is_acti
 def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
     """A .rrd file; it can be read up to the last batch even if the run is killed.
 
-    It has its name only once it can be read: rerun writes the head in parts.
+    It gets its final name only once it can be read: rerun writes the header in parts.
     """
     unnamed = path.with_name(f"{path.name}.new")
     try:
@@ -199,9 +200,9 @@ def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) 
 def write_recording(
     path: Path, name: str, dimension: int, blueprint: rrb.Blueprint, messages: Iterable[Message], *, kind: str
 ) -> None:
-    """Write a .rrd file of complete data, whole or not at all; z is up in it. Raises OSError.
+    """Write complete data, with z up, to a .rrd file, completely or not at all. Raises OSError.
 
-    name : of what is in it; that of a directory that has its final name only later is cut to this one
+    name : of the recording; the suffix .partial-… of an unfinished directory is removed
     """
     stream = open_stream(name.partition(".partial-")[0], dimension, uuid4(), kind)
     memory = stream.memory_recording()
@@ -224,7 +225,7 @@ def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Bluepri
     return Sink(f"the viewer at {address}", stream, connect, patience_s=_VIEWER_PATIENCE_S, is_lossless=False)
 
 
-if __name__ == "__main__":  # by ``is_readable``
+if __name__ == "__main__":  # started by ``is_readable``
     die_first()
     die_with_parent()
     for _ in RrdReader(Path(sys.argv[1])).stream().filter(is_static=False):

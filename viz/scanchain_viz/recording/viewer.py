@@ -1,4 +1,4 @@
-"""rerun's viewer as a process of its own, in a window or a browser; it is never waited for without a limit."""
+"""rerun's viewer as a separate process, in a window or a browser; waiting for its start has a timeout."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _SETTLE_S = 0.5
 
 
 class ViewerError(ScanchainError):
-    """No viewer: what failed and what to do, on one line."""
+    """There is no viewer; the message says what failed and what to do, on one line."""
 
 
 def grpc_address() -> str:
-    """Address at which a viewer on this machine takes data."""
+    """Address at which a viewer on this machine accepts data."""
     return f"rerun+http://{HOST}:{PORT}/proxy"
 
 
@@ -53,7 +53,7 @@ def has_display() -> bool:
 
 
 def start_window() -> None:
-    """Open the viewer's window; it outlives the run. A viewer that is open already is used as it is."""
+    """Open the viewer's window; it outlives the run. A viewer that is already open is used."""
     if is_listening(PORT):
         return
     if not has_display():
@@ -79,7 +79,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def _launch(ports: tuple[int, ...], *arguments: str) -> subprocess.Popen[bytes]:
-    """Start rerun bound to this machine alone (its own default is every interface), and wait for these ports."""
+    """Start rerun bound to localhost only (its default is every interface), and wait for these ports."""
     process = subprocess.Popen(
         [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, "--port", str(PORT), *arguments],
         stdin=subprocess.DEVNULL,
@@ -89,7 +89,7 @@ def _launch(ports: tuple[int, ...], *arguments: str) -> subprocess.Popen[bytes]:
     )
     try:
         _wait(process, ports)
-    except BaseException:  # Ctrl-C as well: it is a process of its own session
+    except BaseException:  # Ctrl-C as well: the process runs in its own session
         stop(process)
         raise
     return process
@@ -102,7 +102,7 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
     while monotonic() < deadline:
         if process.poll() is not None:
             raise ViewerError(
-                f"no viewer: it ended at once with code {process.returncode}; try `rerun` on its own"
+                f"no viewer: it exited immediately with code {process.returncode}; try `rerun` on its own"
             )
         if listening_since is None and all(is_listening(port) for port in ports):
             listening_since = monotonic()
@@ -113,7 +113,7 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
 
 
 def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> None:
-    """Open a .rrd file: a window that lives on by itself, or a page served on this machine until Ctrl-C.
+    """Open a .rrd file: a window that outlives this process, or a page served on this machine until Ctrl-C.
 
     announce : called with the page's address
     """

@@ -1,4 +1,4 @@
-"""report.html of a batch: a row a log, small plots of all trajectories."""
+"""report.html of a batch: one row per log, small plots of the trajectories."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from scanchain_viz.report import page
 
 _MAX_TRAJECTORIES = 60
 _BOX = np.array([1.0, 0.84])  # proportions of the plan of a trajectory
-_BEYOND = 1.05  # of the greatest value, so that its mark is whole
-_MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
+_BEYOND = 1.05  # factor on the size of a plan, so that marks at its edge are not cut off
+_MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a count is marked
 _HEADS = (
     page.Head("log"),
-    page.Head("verdict", "", "reliability of the trajectory; its stretches are in the run's report"),
+    page.Head("verdict", "", "reliability of the trajectory; stretches to check are in the run's report"),
     page.Head("scans"),
     page.Head("contr.", "", "contradicted scans: their correspondences contradict the pose"),
     page.Head("degen.", "", "degenerate scans: a direction of motion is unobservable"),
@@ -53,7 +53,7 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     )
     warnings += [f"{row.log} is not trustworthy: {row.why}" for row in rows if row.state is State.NOT_TRUSTWORTHY]
     paths = (f"{row.log}  {row.run or '–'}  sha256 {row.sha256 or '–'}" for row in rows)
-    folds = (
+    collapsibles = (
         page.Collapsible("Command", shlex.join(without_keys(command))),
         page.Collapsible("Paths", "\n".join(paths)),
     )
@@ -64,7 +64,7 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     sections = (logs, *_trajectories(directory, done, names))
     title = f"Batch of {counted(len(rows), 'log')}"
     subtitle = "Each was run in its own process."
-    page.write_page(directory, page.Page(title, subtitle, totals(rows), warnings, (), sections, folds))
+    page.write_page(directory, page.Page(title, subtitle, totals(rows), warnings, (), sections, collapsibles))
 
 
 def names_of(logs: Sequence[str]) -> dict[str, str]:
@@ -79,7 +79,7 @@ def names_of(logs: Sequence[str]) -> dict[str, str]:
 
 
 def _cells(row: Row) -> Sequence[page.Cell | str]:
-    """The figures of a log, or the reason for none."""
+    """Cells with the metrics of a log, or with the reason why there are none."""
     m = row.metrics
     if m is None:
         return [page.Cell(f"{row.state}: {row.why}", "wide")]
@@ -105,7 +105,7 @@ def _cells(row: Row) -> Sequence[page.Cell | str]:
 
 
 def _link(directory: Path, row: Row) -> str:
-    """The run's report, else what the last try printed, from this page; empty where there is neither."""
+    """Relative link to the run's report, else to the output of the last attempt; empty if there is neither."""
     for path in (Path(row.run) / page.REPORT_FILE if row.run else None, output_file(Path(), row.key)):
         if path is not None and (directory / path).is_file():
             return quote(path.as_posix())
@@ -113,7 +113,7 @@ def _link(directory: Path, row: Row) -> str:
 
 
 def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[page.Section]:
-    """Every trajectory from above, as far as a page can hold them."""
+    """Trajectories seen from above, as many as a page can hold."""
     drawings = [
         page.Drawing.of(names[row.log], row.run, _trajectory(directory / row.run / "trajectory.tum"))
         for row in done[:_MAX_TRAJECTORIES]

@@ -1,4 +1,4 @@
-"""report.html of a comparison, made of the files in its directory."""
+"""report.html of a comparison, made from the files in its directory."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame, trajecto
 from scanchain_viz.report import page, sections
 
 _VERDICT = page.Head(
-    "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for", True
+    "verdict", "", "with its error estimate; other tools are judged by wheels and constant velocity alone", True
 )
-_NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
+_NEARLY = 1.25  # the axes frame the maps that are at most this many times as thick as the sharpest
 
 
 def write_compare_report(directory: Path) -> None:
@@ -54,7 +54,7 @@ def write_compare_report(directory: Path) -> None:
 
 
 def _grid(table: Table, part: str, trajectories: Sequence[DrawnTrajectory]) -> page.Grid:
-    """A row a method; in the summary with its verdict, and the end of a failed one in place of its figures."""
+    """One row per method; in the summary with its verdict, or the reason of a failure in place of its values."""
     columns, is_summary = columns_of(table.figures, part), part == "summary"
     chips = {trajectory.name: trajectory for trajectory in trajectories}
     shown, lines = [column.cells(table.figures) for column in columns], []
@@ -80,7 +80,7 @@ def _sections(
             yield page.Section(f"More on {part}", grid=_grid(table, part, trajectories))
     is_planar = table.dimension == 2
     if trajectories:
-        # those with maps nearly as sharp as the best frame the pictures; all without maps
+        # the axes frame the trajectories with maps nearly as sharp as the best; all if there are no maps
         thickness_m = {row.name: row.figures["thickness_m"] or np.inf for row in table.rows}
         limit_m = _NEARLY * min(thickness_m[each.name] for each in trajectories)
         framing = [each for each in trajectories if thickness_m[each.name] <= limit_m]
@@ -91,7 +91,7 @@ def _sections(
             )
         elif len(framing) < len(trajectories):
             astray = ", ".join(each.name for each in trajectories if thickness_m[each.name] > limit_m)
-            text += f" The axes frame the sharper maps; {astray} may leave them."
+            text += f" The axes frame the sharper maps; {astray} may extend beyond them."
         yield sections.trajectories_section(trajectories, framing, truth, is_planar=is_planar, text=text)
         yield from sections.error_section(trajectories, table.truth)
         yield from sections.relation_section(trajectories)
@@ -112,7 +112,7 @@ def _map_section(
     box: Floats,
     dimension: int,
 ) -> Iterator[page.Section]:
-    """Maps, all within the same corners; those of ``framing`` must be seen whole."""
+    """Maps, all within the same corners; those of ``framing`` must be completely visible."""
     files = [(trajectory, method_folder(directory, trajectory.name) / MAP_FILE) for trajectory in trajectories]
     maps = [(trajectory, read_ply(file)) for trajectory, file in files if file.exists()]
     if not maps:
@@ -123,7 +123,7 @@ def _map_section(
         page.Drawing.of(each.name, "", over_map([], points, *corners, colors=VIRIDIS), each)
         for each, points in maps
     ]
-    text = "The same points of the same scans, placed by the poses of each method."
+    text = "The same points of the same scans, transformed by the poses of each method."
     text += " Dark is low, bright is high." if dimension == 3 else ""
     yield page.Section("Maps", text, drawings=drawings, is_small=True)
 
@@ -135,8 +135,8 @@ def _disagreement(table: Table) -> page.Section:
         for name, values in zip(names, table.disagreement_m, strict=True)
     ]
     text = (
-        "Median distance between the motions that two methods find for a scan, in millimeters. Not a measure of "
-        "accuracy: two methods with the same error agree."
+        "Median distance between the motions that two methods estimate for a scan, in millimeters. Not a measure "
+        "of accuracy: two methods with the same error agree."
     )
     return page.Section("Disagreement", text, grid=page.Grid([page.Head("mm"), *map(page.Head, names)], rows))
 

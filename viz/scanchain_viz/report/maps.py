@@ -34,7 +34,7 @@ _HEADS = (
     page.Head("keyframes"),
     page.Head("closures", "", "closures in force between this session and those of other maps"),
 )
-_GONE = page.Head("gone", "points", "points of its keyframes that newer sessions saw through, removed")
+_GONE = page.Head("removed", "points", "points of its keyframes that newer sessions saw through")
 STATE_COLORS = {
     MapState.SEARCHING: "#8c9096",
     MapState.LOCALIZED: "#3f9b2f",
@@ -44,12 +44,12 @@ STATE_COLORS = {
 }
 _PLACED_LATER = "#0f9bb5"
 _ROWS, _CLOSE_UPS = 200, 12
-_AROUND_M = 3.0  # around a cluster in a close-up
+_AROUND_M = 3.0  # margin around a cluster in a close-up
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
 _HEX = {label: f"#{bytes(COLORS[label]).hex()}" for label in Label}
-_HOW_TOLD = (
-    "A change is named where the scans of the other map looked through the place. Unknown is what the other map "
-    "did not see, or what is too small."
+_HOW_LABELED = (
+    "A point has changed if the scans of the other map saw through its position. It is unknown if the other map "
+    "did not see its position, or if its cluster is too small."
 )
 
 
@@ -101,7 +101,7 @@ def _sessions(drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
         cells = [page.date(each.first_stamp_ns), f"{each.keyframes:,}", f"{each.closures:,}"]
         cells += [f"{each.removed_points:,}"] if metrics.updated else []
         rows.append(page.Row(each.name, cells, line))
-    for group, warning in zip(metrics.apart, metrics.warnings, strict=False):  # of the map come last
+    for group, warning in zip(metrics.apart, metrics.warnings, strict=False):  # those of the map come last
         why = page.Cell(warning.partition(": ")[2], "wide bad")
         rows += [page.Row(name, [why]) for name in group]
     return page.Section("Sessions", grid=page.Grid((*_HEADS, _GONE) if metrics.updated else _HEADS, rows))
@@ -113,11 +113,11 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
     facts = (
         ("scans", f"{m.scans:,} over {m.path_m:.1f} m"),
         ("placed", f"{m.placed:,}, {100.0 * m.placed / max(m.scans, 1):.1f} %"),
-        ("found", f"after {m.found_after_m:.1f} m, {m.found_after_s:.1f} s" if m.found_scan >= 0 else "not"),
-        ("matches with the map", f"{m.matches:,}, {m.rejected:,} left out"),
+        ("found", f"after {m.found_after_m:.1f} m, {m.found_after_s:.1f} s" if m.found_scan >= 0 else "no"),
+        ("matches with the map", f"{m.matches:,}, {m.rejected:,} rejected"),
         ("overlap", f"{m.median_overlap:.2f} (median)" if m.matches else "none"),
         ("standard deviation", f"{m.median_final_sigma_m:.3f} m (median)" if m.matches else "unknown"),
-        ("log-odds of the place", f"{m.log_odds:.0f}" if np.isfinite(m.log_odds) else "none"),
+        ("log-odds of the location", f"{m.log_odds:.0f}" if np.isfinite(m.log_odds) else "none"),
         *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
     )
     subtitle = f"{localized.path.name} in the map {localized.prior.name}"
@@ -158,7 +158,7 @@ def _path_section(localized: LocalizedLog) -> page.Section:
             lines.append(Line(state, np.where(is_in[:, None], live, np.nan), color))
     figure = maps.over_map(lines, points, low, high, path=ends, is_wide=True)
     drawing = page.Drawing.of("Path over the map", "Circle: first scan placed; square: last.", figure)
-    text = "As known at the time; the place of a dashed part was found afterwards, by smoothing."
+    text = "As estimated at the time of each scan; dashed parts were localized afterwards, by smoothing."
     return page.Section("Path in the map", text, lines, [drawing])
 
 
@@ -174,7 +174,7 @@ def _states_picture(localized: LocalizedLog) -> page.Drawing:
     figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
     count = counted(len(found.closures), "match with the map", "matches with the map")
-    text = f"Behind it the state, in the colors above; {count} tried."
+    text = f"Background: the state, in the colors above; {count} tried."
     return page.Drawing.of("Standard deviation of the position", text, figure)
 
 
@@ -184,7 +184,7 @@ def write_changes_report(directory: Path, changes: Changes) -> None:
     counts = np.bincount(changes.labels, minlength=len(Label))
     facts = (
         ("alignment", str(alignment)),
-        ("agreement", f"{100.0 * changes.agreement:.1f} % of what both had in sight"),
+        ("agreement", f"{100.0 * changes.agreement:.1f} % of what both observed"),
         ("resolution", f"{changes.voxel_size_m:g} m, scans up to {changes.reach_m:.0f} m"),
         *((label.name.lower(), f"{counts[label]:,} points") for label in _ORDER),
     )
@@ -199,7 +199,7 @@ def _changed(changes: Changes) -> Iterator[page.Section]:
     drawing = page.Drawing.of(
         "Plan", "Seen from above; boxes around clusters, with their numbers in the table.", plan
     )
-    yield page.Section("Where", _HOW_TOLD, chips, [drawing])
+    yield page.Section("Where", _HOW_LABELED, chips, [drawing])
     if changes.clusters:
         yield page.Section("What changed", grid=_cluster_grid(changes))
         drawings = []
@@ -235,7 +235,7 @@ def _cluster_grid(changes: Changes) -> page.Grid:
         *(page.Head(name, "m") for name in meters),
         page.Head("area", "m²") if is_flat else page.Head("volume", "m³"),
         page.Head("points"),
-        *([page.Head("counterpart", hint="what it became or was when it moved")] if has_moved else ()),
+        *([page.Head("counterpart", hint="number of the cluster that it moved to or from")] if has_moved else ()),
     )
     rows = []
     for each in changes.clusters[:_ROWS]:
@@ -244,4 +244,4 @@ def _cluster_grid(changes: Changes) -> page.Grid:
         cells += (str(each.counterpart or ""),) if has_moved else ()
         rows.append(page.Row(str(each.number), cells))
     left = len(changes.clusters) - _ROWS
-    return page.Grid(heads, rows, [f"and {left:,} smaller ones: {TABLE_FILE}"] if left > 0 else ())
+    return page.Grid(heads, rows, [f"and {left:,} smaller ones in {TABLE_FILE}"] if left > 0 else ())

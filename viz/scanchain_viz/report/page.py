@@ -1,4 +1,4 @@
-"""A self-contained report: one page, in light and dark, on paper and on a phone, with maps to move and turn."""
+"""A self-contained report: one page, in light and dark, for screen, paper and phone, with interactive maps."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ SCRIPT = (_TEMPLATES / "map_viewer.js").read_text(encoding="utf-8")
 _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000
 _HIGHEST = 65_535.0
-_BULK, _MARGIN = (0.5, 99.5), 0.03  # percentiles of the points in view at first; the share added on each side
-_WIDEST = 3.0  # greatest width of a flat map's canvas over its height
-_WIDER = 1.8  # lines, on the canvas
+_BULK, _MARGIN = (0.5, 99.5), 0.03  # percentiles of the points in the initial view; margin on each side
+_WIDEST = 3.0  # greatest width over height of a flat map's canvas
+_WIDER = 1.8  # factor on the width of lines on the canvas
 
 
 @dataclass(frozen=True, slots=True)
 class Chip:
-    """A name in a legend with the line that it is drawn with."""
+    """A name in a legend with the style of its line."""
 
     name: str
     color: str
@@ -48,7 +48,7 @@ Named = Chip | Line | DrawnTrajectory  # what a legend names
 class Cell:
     """A table's cell that is more than its text.
 
-    mark : "best", "bad" for a problem, "doubted" for what may be one, "wide" up to the end of its row; or several
+    mark : "best", "bad" for a problem, "doubted" for what may be one, "wide" for the rest of its row; or several
     """
 
     text: str
@@ -61,7 +61,7 @@ def bad_if(is_bad: bool, text: str) -> Cell:
 
 
 def figure(value: float | None, scale: float, digits: int) -> str:
-    """A figure in a table in its unit, – without a value."""
+    """A number in a table, scaled to its unit; – without a value."""
     return "–" if value is None or not isfinite(value) else f"{scale * value:.{digits}f}"
 
 
@@ -71,16 +71,16 @@ def date(stamp_ns: int) -> str:
 
 
 def verdict_cell(verdict: str, text: str = "") -> Cell:
-    """A verdict in a table, in other words if there are any, in the color of its severity; empty for none."""
+    """A verdict in a table, or ``text`` in its place, in the color of its severity; empty without a verdict."""
     marks: dict[str, str] = {Verdict.NOT_TRUSTWORTHY: "bad", Verdict.CHECK: "doubted"}
     return Cell(text or verdict, marks.get(verdict, ""))
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A table's row: its subject, with its line in the drawings if it has one, and its cells.
+    """A table's row: its subject, with the style of its line in the drawings if it has one, and its cells.
 
-    ``link`` : a page or file beside this one with details
+    ``link`` : relative, to a page or file with details
     """
 
     name: str
@@ -91,7 +91,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """A column's head: name, unit, definition, and whether words stand below it."""
+    """A column's head: name, unit, definition, and whether its cells are words."""
 
     text: str
     unit: str = ""
@@ -101,7 +101,7 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A table, and notes on its reading, a line each."""
+    """A table, and notes on how to read it, one line each."""
 
     heads: Sequence[Head]
     rows: Sequence[Row]
@@ -110,9 +110,9 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A picture with its caption; ``svg`` comes from a ``Plot`` or is a map to move, all else is escaped.
+    """A picture with its caption; ``svg`` comes from a ``Plot`` or is an interactive map, all else is escaped.
 
-    ``is_wide`` : over the whole width of the page; ``is_scripted`` : drawn by ``SCRIPT``; ``is_still`` : shown
+    ``is_wide`` : across the whole width of the page; ``is_scripted`` : drawn by ``SCRIPT``; ``is_still`` : shown
     instead of a scripted one in print and where scripts do not run
     """
 
@@ -156,7 +156,7 @@ class Collapsible:
 class Page:
     """A report; ``facts`` are label and value, ``warnings`` stand out, ``notes`` do not.
 
-    ``judged`` : the verdict, which stands at its head; ``refuted`` : what the truth refutes of it, in red
+    ``judged`` : the verdict, at the top; ``refuted`` : how the ground truth contradicts it, in red
     """
 
     title: str
@@ -192,7 +192,7 @@ def interactive_map(
 ) -> Drawing:  # fmt: skip
     """The canvas in which ``SCRIPT`` draws a map (M, 3) and lines; points outside of the corners are left out.
 
-    grain_m : distance of neighboring points of the map, which is how large they are drawn from near by
+    grain_m : distance of neighboring points of the map, the size at which they are drawn in close-ups
     """
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     shown = inside[:: max(1, -(-len(inside) // _MAX_POINTS))]
@@ -219,7 +219,7 @@ def interactive_map(
 
 
 def _first_view(points: Points, lines: Sequence[Line], low: Floats, high: Floats) -> Floats:
-    """Corners (2, 3) of what is in view at first: all lines and most points, with a margin."""
+    """Corners (2, 3) of the initial view: all lines and most points, with a margin."""
     bulk = np.percentile(points, _BULK, axis=0) if len(points) else np.empty((0, 3))
     seen = np.vstack([bulk, *(line.positions for line in lines)])
     first, last = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
@@ -245,7 +245,7 @@ def _line(line: Line, low: Floats, high: Floats) -> dict[str, object]:
 
 
 def _packed(positions: NDArray[np.floating], low: Floats, high: Floats) -> str:
-    """As 16-bit fractions of the box, least significant byte first, in base64."""
+    """Positions as 16-bit fractions of the box, least significant byte first, in base64."""
     size = np.maximum(high - low, 1e-9)
     fractions = np.clip(np.rint(_HIGHEST * (positions - low) / size), 0.0, _HIGHEST)
     return b64encode(fractions.astype("<u2").tobytes()).decode("ascii")

@@ -1,4 +1,4 @@
-"""Pictures of pose graphs and landmark problems, before and after optimization, and the page of the latter."""
+"""Pictures of pose graphs and landmark problems, before and after optimization, and the report of the latter."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from scanchain_viz.report import page
 _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
 BEFORE, AFTER = "#e07b00", "#1f5fd0"
-_MARGIN = 0.05, 1e-3  # of a view: share of its extent, least
+_MARGIN = 0.05, 1e-3  # of a view: share of its extent, least meters
 _PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
 _ELLIPSE_POINTS = 37
 _BLUES = ("f7fbff", "deebf7", "c6dbef", "9dcae1", "6aaed6", "4191c6", "2070b4", "08509b", "08306b")
 _TIMES = (
-    "Times are medians; each method solves from scratch with what it needs to know about the pattern (again: with "
-    "that kept)."
+    "Times are medians; each method solves from scratch, including its analysis of the sparsity pattern (again: "
+    "with that analysis reused)."
 )
-_DIFFERS = "Differs by is the largest difference of an unknown from the first method."
-_PINV = "Entries of (AᵀA)⁻¹ stand for the factor that pinv does not have."
+_DIFFERS = "Differs by: largest difference of any unknown from the first method."
+_PINV = "pinv has no factor; the entries of (AᵀA)⁻¹ are shown and counted instead."
 
 
 def draw_graph(change: GraphChange, path: Path) -> None:
@@ -79,7 +79,7 @@ def _estimates(study: Study) -> tuple[Plot, Plot]:
 
 
 def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
-    """An estimate over the truth, in its frame where there is one."""
+    """An estimate over the ground truth, in the truth's frame if there is one."""
     points = [study.true_poses, study.true_landmarks, *study.before.in_truth(), *study.after.in_truth()]
     figure = Plot.of_plan(*around(np.concatenate(points), *_MARGIN))
     poses, landmarks = estimate.in_truth()
@@ -101,7 +101,7 @@ def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _factor(method: MethodResult) -> Plot:
-    """Nonzero entries of a method's factor, dark; a pixel of many entries is as dark as they are dense."""
+    """Nonzero entries of a method's factor, dark; a pixel of several entries is darker the denser they are."""
     matrix, size = method.factor.matrix.tocoo(), len(method.factor.order)
     there, pixels = matrix.data != 0.0, min(size, _PIXELS)
     count, _, _ = np.histogram2d(
@@ -131,8 +131,8 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
         definitions = dict.fromkeys(study.after.definition for study in studies)
-        fold = page.Collapsible("Definition of the errors", "\n\n".join(definitions))
-        page.write_page(directory, page.Page(title, names, sections=sections, collapsibles=[fold]))
+        definition = page.Collapsible("Definition of the errors", "\n\n".join(definitions))
+        page.write_page(directory, page.Page(title, names, sections=sections, collapsibles=[definition]))
     except OSError as error:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
 
@@ -156,7 +156,7 @@ def _solver_section(study: Study) -> page.Section:
     factors = [
         page.Drawing.of(f"{method.method}: {method.factor.name}", "", _factor(method)) for method in study.methods
     ]
-    text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
+    text = f"The Jacobian A has {size_of(study)}. The pictures show the nonzero entries of each method's factor."
     headings, *rows = table_of(study)
     split = [heading.partition(" ms") for heading in headings]
     heads = [page.Head(name, unit.strip()) for name, unit, _ in split]

@@ -1,4 +1,4 @@
-"""report.html of a run, made of the files in its directory."""
+"""report.html of a run, made from the files in its directory."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ _ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the h
     (page.Head("KITTI rot.", "deg/m"), "kitti_rotation_rad_per_m", np.degrees(1.0), 4),
 )
 _SHADE = "#8c9096"
-_MAX_ROWS = 100  # largest number of stretches in the table; the longest
+_MAX_ROWS = 100  # largest number of stretches in the table; the longest are kept
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _DISPUTED = "at closures rejected by the back end"
-_STATES = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)  # named as those of scans
+_STATES = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)  # kinds that are also states of scans
 _OVER_STATES = (Kind.OVERLAP, Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED, Kind.COPIES)
 
 
@@ -121,7 +121,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
 
 
 def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: float) -> page.Section:
-    """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners (2, 3)."""
+    """The map (M, 3), its points ``grain_m`` apart, and lines within corners (2, 3), the trajectory first."""
     is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
     corners = surroundings(box, [points])
     over = over_map(lines, points, *corners, path=path)
@@ -134,7 +134,7 @@ def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: flo
 def trajectory_lines(
     path: Floats, steps: pa.Table, closures: pa.Table | None, stretches: Sequence[Stretch], truth: Floats | None
 ) -> list[Line]:
-    """The trajectory, closures by verdict, what is to check on it, a scan in several of them, and the truth."""
+    """The trajectory, closures by verdict, scans to check (one may be in several lines), and the ground truth."""
     lines = [Line("trajectory", path, OPTIMIZED, 1.2)]
     if closures is not None and len(closures):
         lines += _closure_lines(path, closures)
@@ -146,7 +146,7 @@ def trajectory_lines(
         for each in stretches:
             is_marked[each.first : each.last + 1] |= each.kind is kind
         marks.append((str(kind), is_marked, kind))
-    for name, is_marked, kind in marks:  # the later are drawn on top
+    for name, is_marked, kind in marks:  # later ones are drawn on top
         if is_marked.any():
             name = f"{name}: {counted(int(is_marked.sum()), 'scan')}"
             leads_there = is_marked | np.append(is_marked[1:], False)
@@ -158,7 +158,7 @@ def trajectory_lines(
 
 
 def _closure_lines(path: Floats, closures: pa.Table) -> Iterator[Line]:
-    """Closures by verdict with their numbers, as lines over a path (N, 3); of many every n-th is drawn."""
+    """Closures by verdict with their numbers, as lines over a path (N, 3); only every n-th if there are many."""
     ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
     rejected_by = np.array(closures["rejected_by"].to_pylist())
     for by, (name, color) in CLOSURES.items():
@@ -179,7 +179,7 @@ def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
 
 
 def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
-    """Innovations along the log over their limits, and every suspicious stretch."""
+    """Innovations along the log, relative to their limits, and the stretches to check."""
     figure, chips = Plot("scan", "innovation / limit", is_wide=True), []
     shaded = [each for each in metrics.stretches if each.kind is not Kind.LOOPS]
     for each in shaded:
@@ -193,9 +193,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
     chips += [page.Chip("stretches to check", _SHADE)] if shaded else []
     size = sections.window(len(steps))
     largest = f", largest of {size} neighboring scans" if size > 1 else ""
-    text = (
-        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip."
-    )
+    text = f"Normalized innovations over their limits{largest}; above 1 (dotted): a finding, or wheel slip."
     grid = _stretches(metrics.stretches) if metrics.stretches else None
     return page.Section("Checks", "", chips, [page.Drawing.of("Innovations", text, figure)], grid)
 
@@ -213,7 +211,7 @@ def _stretches(stretches: Sequence[Stretch]) -> page.Grid:
         page.Head("start", "s"), page.Head("end", "s"), page.Head("size", "m"),
     )  # fmt: skip
     left = len(stretches) - len(rows)
-    return page.Grid(heads, rows, [f"and {left:,} shorter ones: metrics.json"] if left else ())
+    return page.Grid(heads, rows, [f"and {left:,} shorter ones in metrics.json"] if left else ())
 
 
 def accuracy_section(truth: GroundTruth) -> page.Section:
@@ -232,7 +230,7 @@ def accuracy_section(truth: GroundTruth) -> page.Section:
 
 
 def _stages(metrics: Metrics) -> page.Grid:
-    """Time of a scan by stage."""
+    """Time per scan by stage."""
     names = (*STAGES, "all_but_read")
     heads = (page.Head("stage"), *(page.Head(name.replace("_", " "), "ms") for name in names))
     rows = [

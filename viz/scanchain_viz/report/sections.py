@@ -23,7 +23,7 @@ from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, He
 
 _MAX_POINTS = 1500  # largest number of points of a line
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
-_SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
+_SHOWN_SHARES = (0.5, 99.5)  # percentiles of a distribution that are shown
 CLIPPED = (0.01, 1000.0)  # range of observability and innovations that is drawn
 
 
@@ -103,12 +103,12 @@ def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = 
     known = _known(trajectories, "seconds")
     if not known:
         return
-    figure = Plot("scan", "time of a scan [ms]", logarithmic="y")
+    figure = Plot("scan", "time per scan [ms]", logarithmic="y")
     for each in reversed(known):
         _draw(figure, each, windowed(1e3 * each.seconds, np.median), 0.9)
     drawings = (
         Drawing.of("Along the log", _of_neighbors("Medians", known, "seconds"), figure),
-        _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
+        _distribution(known, "seconds", 1e3, "time per scan [ms]", "scans that took less"),
     )
     yield Section("Time per scan", "", _legend(known), drawings, stages)
 
@@ -146,8 +146,8 @@ def _distribution(
 
 
 def _consistency(estimated: Sequence[DrawnTrajectory], degrees_of_freedom: int) -> Drawing:
-    """Distribution of the NEES beside the one that exact covariances would give (dotted)."""
-    figure = Plot("squared error over covariance (1 is exact on average)", "motions below [%]", logarithmic="x")
+    """Distribution of the NEES, and the one that exact covariances would give (dotted)."""
+    figure = Plot("NEES per degree of freedom (1 on average if exact)", "motions below [%]", logarithmic="x")
     for each in reversed(estimated):
         _cumulative(figure, each, each.nees, 1e-4)
     shares = np.linspace(0.001, 0.999, 200)
@@ -155,14 +155,14 @@ def _consistency(estimated: Sequence[DrawnTrajectory], degrees_of_freedom: int) 
     figure.line(np.stack([ideal, 100.0 * shares], axis=1), INK, THIN, DOTS)
     figure.y.limit(0.0, 100.0)
     text = (
-        "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it they are "
-        "too large, to the right too small."
+        "Squared error of each motion normalized by its covariance. Dotted: exact covariances; to the left of "
+        "it they are too large, to the right too small."
     )
     return Drawing.of("Covariance consistency", text, figure)
 
 
 def _cumulative(figure: Plot, trajectory: DrawnTrajectory, values: Floats, least: float) -> Floats:
-    """Draw per cent of the known values below each; returns these in order, none below the least."""
+    """Draw the cumulative distribution of the finite values; returns them sorted, none below ``least``."""
     ordered = np.maximum(np.sort(values[np.isfinite(values)]), least)
     rows = np.unique(_some(len(ordered)))
     _draw(figure, trajectory, np.stack([ordered, np.linspace(0.0, 100.0, len(ordered))], axis=1)[rows])
@@ -170,17 +170,17 @@ def _cumulative(figure: Plot, trajectory: DrawnTrajectory, values: Floats, least
 
 
 def _some(count: int) -> NDArray[np.int64]:
-    """Rows of so many, the first and the last among them, that a line is drawn through."""
+    """Rows, out of ``count``, that a line is drawn through, including the first and the last."""
     return np.linspace(0, count - 1, min(count, _MAX_POINTS)).astype(np.int64)
 
 
 def window(count: int) -> int:
-    """Number of neighboring values, of so many, that make a point of a line."""
+    """Number of neighboring values, out of ``count`` in total, that are combined to a point of a line."""
     return max(1, -(-count // _WINDOWS))
 
 
 def windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = None) -> Floats:
-    """Points (K, 2) of a line that can be read: neighboring values put together, over the means of x or scans."""
+    """Points (K, 2) of a readable line: neighboring values combined, over the mean of x or of the scan numbers."""
     size = window(len(values))
     count = len(values) // size * size
     over = np.arange(len(values), dtype=np.float64) if x is None else x
@@ -189,13 +189,13 @@ def windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = 
 
 
 def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
-    """The caption of lines whose points stand for several scans each; none where each is a scan."""
+    """Caption of lines whose points each combine several scans; empty if each point is one scan."""
     size = window(max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories))
     return f"{what} of {size} neighboring scans." if size > 1 else ""
 
 
 def read_closures(file: Path) -> pa.Table | None:
-    """A row a loop closure tried; None where loops were not sought."""
+    """Table with one row per loop closure tried; None if loop closures were not searched for."""
     return pq.ParquetFile(file).read() if file.exists() else None  # read_table imports much more
 
 
@@ -229,7 +229,7 @@ def _verdict_grid(closures: pa.Table) -> Grid:
 
 
 def provenance_sections(made: Provenance, others: dict[str, str]) -> Iterator[Collapsible]:
-    """The command, and the versions of its packages."""
+    """The command, the versions of its packages, and its log files."""
     yield Collapsible("Command", shlex.join(made.command))
     versions = {"python": made.python} | made.versions | others
     lines = (f"{name} {number or 'not installed'}" for name, number in versions.items())

@@ -1,8 +1,8 @@
 """Sparse Cholesky factorization A = Uᵀ U by dense fronts, solves with it, the inverse where A is not 0; compiled.
 
 Multifrontal method (Duff & Reid 1983; Liu 1992): every front gathers its entries of A and the update matrices of
-its children, eliminates its pivots and hands the rest on. Fronts are row-major and only their upper triangle is
-used, so that every inner loop runs along a row.
+its children, eliminates its pivots and passes its update matrix on. Fronts are row-major and only their upper
+triangle is used, so that every inner loop runs along a row.
 """
 
 import numpy as np
@@ -65,7 +65,7 @@ def factorize(
 def solve_lower(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
     """Solve Uᵀ x = b in place; x (n,) is ordered as the elimination, local : fronts.widest scalars.
 
-    path : fronts that are visited, ascending, with each its parent: all of them, or those that begin where b is
+    path : fronts to visit, ascending, each with its parent: all of them, or those that begin where b is
         not zero; x is zero in the rest
     """
     for f in path:
@@ -207,7 +207,8 @@ def selected_inverse(
 
     From A = Uᵀ U follows U Z = U⁻ᵀ, which is zero above the diagonal; row a of a front, Z being known below it:
         Z_ac = −Σ_{m>a} U_am Z_mc / U_aa for c > a,      Z_aa = (1 / U_aa − Σ_{m>a} U_am Z_ma) / U_aa
-    What a front needs of Z beyond its pivots its parent has; it waits on the stack, as the update matrices did.
+    The part of Z beyond its pivots that a front needs is in its parent; it is kept on the stack, like the update
+    matrices before.
 
     factor : as ``factorize`` left it; inverse : block values, laid out as those of A, filled
     stack : fronts.stack_size scalars of room, work : fronts.widest² scalars of room

@@ -12,7 +12,7 @@ def path_lengths(
 ) -> NDArray[np.float64]:
     """Length (count,) of the shortest path from one node to every node, infinite beyond the limit (Bellman 1958).
 
-    All edges are relaxed to and fro until nothing changes: along a chain once is enough.
+    All edges are relaxed back and forth until nothing changes: for a chain, one pass is enough.
 
     edges : (E, 2) pairs of nodes, passed in both directions; lengths : (E,) ≥ 0, infinite for a closed one
     """

@@ -1,6 +1,7 @@
 """Symbolic analysis for the sparse Cholesky factorization, once per pattern: tree, structure, fronts; compiled.
 
-All works on blocks (variables such as poses), but for the layout of the fronts, which expands them to scalars.
+All functions work on blocks (variables such as poses), except the layout of the fronts, which expands them to
+scalars.
 """
 
 from typing import NamedTuple
@@ -86,7 +87,7 @@ def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _
 
 @njit(nogil=True)
 def _structures(start: _Index, neighbors: _Index, order: _Index, parent: _Index) -> tuple[_Index, _Index]:
-    """The same, not in order."""
+    """``column_structures``, with unsorted rows."""
     n = order.size
     place = np.empty(n, np.int64)
     for k in range(n):
@@ -121,11 +122,11 @@ def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
 
 @njit(nogil=True)
 def group_columns(parent: _Index, begin: _Index, rows: _Index, sizes: _Index) -> _Index:
-    """First position of every front (and n at the end): columns with nearly the same structure join.
+    """First position of every front (and n at the end): columns with nearly the same structure are merged.
 
-    Columns of equal structure form a front. Then a front joins its parent where it directly precedes it and few
-    explicit zeros arise (relaxed supernodes, Ashcraft & Grimes 1989; thresholds of Chen et al. 2008): any number
-    up to 4 scalar columns, 80 % up to 16, 10 % up to 48, 5 % above.
+    Columns of equal structure form a front. A front is then merged into its parent if it directly precedes it and
+    few explicit zeros arise (relaxed supernodes, Ashcraft & Grimes 1989; thresholds of Chen et al. 2008): any
+    number up to 4 scalar columns, 80 % up to 16, 10 % up to 48, 5 % above.
 
     sizes (n,) : scalars of the variable at each position
     """
@@ -165,7 +166,7 @@ def group_columns(parent: _Index, begin: _Index, rows: _Index, sizes: _Index) ->
 
 @njit(inline="always")
 def _most_zeros(columns: int) -> float:
-    """Share of explicit zeros that a front of so many scalar columns may hold."""
+    """Largest share of explicit zeros in a front with this number of scalar columns."""
     if columns <= 4:
         return 1.0
     if columns <= 16:
@@ -180,9 +181,9 @@ class Fronts(NamedTuple):
     rows : scalar position in the elimination order of every row of every front
     pivots : (F,) number of scalar columns that the front eliminates
     factor_start : (F + 1,) into the factor's values; front f keeps the rows of its pivots, from the diagonal on
-    parent, children : (F,) the front that takes the update matrix, -1 for none, and how many hand theirs to it
-    place : like ``rows``: row of the parent front that an update row falls on
-    stack_size : most scalars of update matrices, their upper triangles, waiting at one time
+    parent, children : (F,) the front that receives the update matrix, -1 for none; how many pass theirs to it
+    place : like ``rows``: row of the parent front that corresponds to an update row
+    stack_size : largest number of scalars in stored update matrices, as upper triangles, at one time
     widest : most rows of a front
     """
 
@@ -203,8 +204,8 @@ class Blocks(NamedTuple):
     start : (F + 1,)
     offset : of the block among the matrix's values, where it is kept row-major
     height, width : of the block as kept
-    top, left : its place in the front, in the upper triangle
-    turned : 1 where the front takes its transpose
+    top, left : its position in the front, in the upper triangle
+    turned : 1 where the front contains its transpose
     """
 
     start: _Index
@@ -281,7 +282,7 @@ def _index_in_front(row_start: _Index, rows: _Index, front: _Index, row: _Index)
 
 
 def ranges(starts: _Index, counts: _Index) -> _Index:
-    """The numbers from each start on, so many, one range after the other."""
+    """Concatenated ranges of consecutive numbers, from their starts and counts."""
     return np.repeat(starts - np.cumsum(counts) + counts, counts) + np.arange(int(counts.sum()))
 
 

@@ -15,7 +15,7 @@ def products(
     row_start: _Index, columns: _Index, values: _Array, b: _Array, split: int, band: _Array, border: _Array,
     corner: _Array, g: _Array,
 ) -> None:  # fmt: skip
-    """Add up H = AᵀA, in three parts, and g = Aᵀb.
+    """Sum up H = AᵀA, in three parts, and g = Aᵀb.
 
         H = [P, Bᵀ; B, C],  band[w + i − j, j] = P_ij for i ≤ j  (LAPACK's upper band of width w)
 
@@ -195,15 +195,15 @@ def rotate(
 ) -> None:  # fmt: skip
     """Rotate A into R, row after row, by Givens rotations; Q is not stored.
 
-    A row of A meets those rows of R alone that lie on the path of the elimination tree from its first column on
-    (George & Heath 1980): with one of them it is rotated so that its first entry vanishes, or it becomes the row
-    of R itself where there is none yet.
+    A row of A affects only those rows of R on the path of the elimination tree from its first column to the root
+    (George & Heath 1980): it is rotated with each of them so that its first entry vanishes, or becomes that row of
+    R where there is none yet.
 
-    rows : of A, in the order that they come in
+    rows : of A, in the order of insertion
     row_start (m + 1,), columns, values, b (m,) : A by rows, and the right-hand side
     place (n,) : of each column; begin (n + 1,), right, parent (n,) : columns to the right of the diagonal in each
         row of R, and its tree
-    R : filled row by row, the diagonal before what is right of it; z (n,) filled with the head of Qᵀb
+    R : filled row by row, the diagonal before the entries to its right; z (n,) filled with the head of Qᵀb
     """
     row = np.zeros(parent.size)
     for r in rows:

@@ -20,8 +20,8 @@ def bearing_range(
         δ = l − t,  q = ‖δ‖,  r = [wrap(atan2(δ_y, δ_x) − θ − bearing), q − range]
         ∂r/∂t = [δ_y/q², −δ_x/q²; −δ_x/q, −δ_y/q],  ∂r/∂θ = [−1; 0],  ∂r/∂l = −∂r/∂t
 
-    On top of the pose a landmark has no bearing; there it is taken to lie in the measured direction, and only the
-    range pulls it.
+    A landmark at the position of the pose has no bearing; it is assumed in the measured direction, and only the
+    range has a residual.
 
     poses : (K, 2) x, y, with heading 0, or (K, 3) x, y, θ; landmarks (L, 2); m, rad
     observed (N, 2) pose and landmark, measured (N, 2) bearing rad, range m, whitening (2, 2) W
@@ -55,7 +55,7 @@ def bearing_range(
 
 @njit()
 def odometry(poses: _Array, moved: _Array, whitening: _Array, residuals: _Array, jacobians: _Array) -> None:
-    """Fill W r and W J of every motion from a pose to the next, measured in the frame of its beginning.
+    """Fill W r and W J of every motion from a pose to the next, measured in the frame of the first.
 
         r = [Rᵀ(θ_i) (t_j − t_i) − t_z, wrap(θ_j − θ_i − θ_z)]
         ∂r/∂(t_i, θ_i) = [−Rᵀ, (∂Rᵀ/∂θ_i)(t_j − t_i); 0, −1],  ∂r/∂(t_j, θ_j) = [Rᵀ, 0; 0, 1]
@@ -91,14 +91,14 @@ def integrate(times_s: _Array, velocities: _Array, nodes_s: _Array, motion: _Arr
 
     A velocity holds until the next one comes. An arc of duration τ at (v, ω) moves by
         θ ← θ + ω τ,  t ← t + v τ sinc(ω τ / 2) (cos, sin)(θ + ω τ / 2)
-    Noise that grows with what is driven spreads the motion by P ← F P Fᵀ + G d Gᵀ, F and G of the arc at its
+    Noise that grows with distance or angle adds covariance: P ← F P Fᵀ + G d Gᵀ, F and G of the arc at its
     middle (Thrun, Burgard & Fox 2005, ch. 5), from four sources: forward, sideways and turning with d = |v| τ,
     turning with d = |ω| τ.
 
     times_s (M,) ascending, velocities (M, 2) v in m/s and ω in rad/s, nodes_s (K,) ascending
     motion (K − 1, 3) x, y, θ in the frame of the earlier node : filled
-    spread (K − 1, 4, 3, 3) covariance of the motion from each source of unit density : filled; given as
-        (K − 1, 0, 3, 3) the motion alone is worked out
+    spread (K − 1, 4, 3, 3) covariance of the motion from each source of unit density : filled; with shape
+        (K − 1, 0, 3, 3) only the motion is computed
     """
     at = 0
     F = np.eye(3)
@@ -111,7 +111,7 @@ def integrate(times_s: _Array, velocities: _Array, nodes_s: _Array, motion: _Arr
             while at + 1 < times_s.size and times_s[at + 1] <= now:
                 at += 1
             until = nodes_s[k + 1]
-            if times_s[at] > now:  # before the first velocity the robot stands
+            if times_s[at] > now:  # before the first velocity the robot is at standstill
                 until, v, turn_rate = min(until, times_s[at]), 0.0, 0.0
             else:
                 if at + 1 < times_s.size:

@@ -1,1 +1,1 @@
-"""Correspondences, residuals, the descent, and how well a pose is determined; compiled."""
+"""Correspondences, residuals, optimization and observability of a pose; compiled."""

@@ -1,4 +1,4 @@
-"""Correspondences: the nearest voxel mean of every point, their weights, and the pairs of the closed form."""
+"""Correspondences: the nearest voxel mean of every point, and their weights."""
 
 import numpy as np
 
@@ -19,9 +19,9 @@ from scanchain.kernels.voxels import (
 )
 
 _GRAZING_SINE = 0.05  # of the angle between ray and plane at which the weight is halved
-_RING_WIDTHS = 2.0  # widths of a plane that a ray may spend within its thickness before the weight is halved
-_NOISE_WIDTHS = 3.0  # times σ, the width of a plane at which half of its normal is noise
-_UPRIGHT_COSINE = 0.5  # between a line and the lidar's vertical, at which the weight is halved
+_RING_WIDTHS = 2.0  # path of a ray within the thickness of a plane, in widths of it, at which the weight is halved
+_NOISE_WIDTHS = 3.0  # width of a plane, in σ, at which half of its normal is noise
+_UPRIGHT_COSINE = 0.5  # of the angle between a line and the lidar's vertical, at which the weight is halved
 
 
 @njit(nogil=True)
@@ -31,8 +31,8 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, corresponden
     points : (N, d) meters; T moves them into the map's frame
     reach : voxels searched to each side: the 2ʳᵉᵃᶜʰ-fold of each axis around the point, (2·reach)ᵈ voxels
     correspondence : −1 where no mean is near enough
-    A ring of voxels is searched only if a mean in it could be nearer than those found within: r rings hold all
-    that lies nearer than r − ½ voxels.
+    A ring of voxels is searched only if a mean in it could be nearer than those found so far: r rings contain all
+    means nearer than r − ½ voxels.
     """
     scale = 1.0 / voxels.size_m
     flat = points.shape[1] == 2
@@ -57,7 +57,7 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, corresponden
                         ey = voxels.cells[voxel, 1] - y
                         ez = voxels.cells[voxel, 2] - z
                         distance = ex * ex + ey * ey + ez * ez
-                        is_nearer = distance < nearest  # which no processor foresees: without a branch
+                        is_nearer = distance < nearest  # unpredictable, hence without a branch
                         nearest = min(distance, nearest)
                         chosen += is_nearer * (voxel - chosen)
             covered = (ring - 0.5) * voxels.size_m
@@ -74,12 +74,12 @@ def weigh(voxels, points, T, correspondence, variance: float, weight):
 
     On a plane of thickness τ, fitted to n points with eigenvalues λ along and λ' across it, the residual at
     (a, c) from the mean has the variance max(τ², σ²)·(1 + 1/n + a²/(nλ) + c²/(nλ'))    (after Yuan et al. 2022).
-    The points of one ring lie in a plane of their own, seen edge-on, that moves along with the lidar. A plane
-    therefore has little weight where the ray grazes it, where the ray would stay within τ for longer than √λ',
-    and where √λ' is no more than noise. In 2D every correspondence with a line has the weight 1.
-    A line has the weight of its thickness where it is upright, so that several rings measured it: poles, trunks.
-    Other lines are rings, mostly; like voxels without a shape, their mean represents a surface to within s/2 of a
-    voxel of size s.
+    The points of a single ring lie in a plane, seen edge-on, that moves along with the lidar. A plane therefore
+    has a low weight where the ray grazes it, where the ray would stay within τ for longer than √λ', and where √λ'
+    is no more than noise. In 2D every correspondence with a line has the weight 1.
+    A line is weighted by its thickness where it is upright, i.e. measured by several rings: poles, trunks. Other
+    lines are mostly single rings; like that of voxels without a shape, their mean represents the surface to within
+    s/2 for a voxel of size s.
 
     points : (N, d) meters, source frame; correspondence : (N,) rows of the map's voxels, −1 for none
     T : (d+1, d+1); the lidar's z axis is that of its rings
@@ -120,7 +120,7 @@ def _plane_variance(cell, ex, ey, ez) -> float:
 
 @njit(inline="always")
 def _surface_weight(cell, x, y, z, variance: float) -> float:
-    """Weight of a plane that the ray (x, y, z) hits, as a surface rather than the points of one ring, 0 to 1."""
+    """Weight of a plane hit by the ray (x, y, z), low where its points may be those of one ring, 0 to 1."""
     out = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
     sine2 = out * out / max(x * x + y * y + z * z, 1e-300)
     width2 = cell[MEAN_TERM] / cell[SLOPE_ACROSS]
@@ -130,7 +130,7 @@ def _surface_weight(cell, x, y, z, variance: float) -> float:
 
 @njit(inline="always")
 def _upright_weight(cell, T, x, y, z) -> float:
-    """Weight of a line by how far it runs across the rings, along the growing elevation of the ray, 0 to 1."""
+    """Weight of a line by its alignment with increasing elevation of the ray, across the rings, 0 to 1."""
     zx, zy, zz = T[0, 2], T[1, 2], T[2, 2]
     height = (x * zx + y * zy + z * zz) / max(x * x + y * y + z * z, 1e-300)
     ux, uy, uz = zx - height * x, zy - height * y, zz - height * z

@@ -20,15 +20,15 @@ from scanchain.kernels.voxels import LINE, PLANE, POINT, SHAPE, move, shape_of
 CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
 
 SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
-SLACK = 0.02  # voxels that points may move before they are associated again
-PATIENCE = 20  # steps at the last scale, after which correspondences are fixed
+SLACK = 0.02  # voxels that points may move before they are re-associated
+PATIENCE = 20  # steps at the final scale, after which correspondences are fixed
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 _SECTORS = 8  # of a scan
 _COST, _WEIGHT, _SQUARES, _DAMPING = 0, 1, 2, 3  # entries of ``Iterate.sums``
 
 
 class Iterate(NamedTuple):
-    """A pose, its twist ``offset`` (k,) from the predicted one, and the normal equations there.
+    """A pose, its twist ``offset`` (k,) from the predicted one, and its normal equations.
 
     sums : (4,) cost in m², Σ w, Σ w r² in m², damping
     """
@@ -44,8 +44,8 @@ class Fit(NamedTuple):
     """Residuals of a problem at a pose.
 
     H (k, k) : Σ w JᵀJ over planes and lines, twists about the problem's origin, map axes; the mean of a voxel
-        without a shape constrains a pose in every direction, whether the surface there does or not
-    cost : robust cost in m², every point without a correspondence at its limit ½s²
+        without a shape would constrain a pose in every direction, whether the surface does or not
+    cost : robust cost in m², with the limit ½s² for every point without a correspondence
     total_weight, squares : Σ w and Σ w r² (m²)
     pairs, iterations, ending : correspondences, linearizations, one of the codes above
     """
@@ -77,9 +77,9 @@ def align(problem, T, offset, first_scale_m: float):
     """``Fit`` at a minimum near T (d+1, d+1), which is moved there in place.
 
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, ξ being the twist from the predicted
-    pose, ``offset`` (k,) at first. Points are associated again when they have moved by more than SLACK, until
-    PATIENCE steps were taken with the kernel at its last scale: correspondences may alternate without end.
-    first_scale_m : that the kernel's scale shrinks from
+    pose, ``offset`` (k,) at first. Points are re-associated when they have moved by more than SLACK, until
+    PATIENCE steps were taken at the final kernel scale: correspondences may alternate endlessly.
+    first_scale_m : initial kernel scale
     """
     settings, size_m, k = problem.settings, problem.voxels.size_m, offset.shape[0]
     now = Iterate(T, offset.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
@@ -121,7 +121,7 @@ def align(problem, T, offset, first_scale_m: float):
 
 @njit(nogil=True)
 def fit_at(problem, T, iterations: int, ending: int):
-    """``Fit`` at the pose T itself, by correspondences within the last distance; the rest is given."""
+    """``Fit`` at the pose T itself, with correspondences within the final distance."""
     settings = problem.settings
     pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
     cost, total_weight, squares = robust_sums(problem, T, settings.scale_m)
@@ -133,8 +133,8 @@ def fit_at(problem, T, iterations: int, ending: int):
 def gradients_of_sectors(problem, T):
     """Gradients (8, k) of the points of each sector at the pose T.
 
-    Sectors lie ahead or behind, left or right, nearer or farther than the problem's range: calibration, motion
-    within the scan and surfaces that repeat shift the points of one together.
+    Sectors lie ahead or behind, left or right, nearer or farther than the problem's range: errors of calibration,
+    of deskewing and from repetitive surfaces shift the points of one sector together.
     """
     points, sector = problem.points, np.empty(problem.points.shape[0], np.int32)
     for i in range(points.shape[0]):
@@ -149,7 +149,7 @@ def gradients_of_sectors(problem, T):
 
 @njit(nogil=True)
 def correspond(problem, T, reach: int, max_distance_m: float):
-    """Number of correspondences of the problem at the pose T, which are associated and weighted again."""
+    """Number of correspondences of the problem, re-associated and re-weighted at the pose T."""
     pairs = associate(problem.voxels, problem.points, T, reach, max_distance_m, problem.correspondence)
     if pairs:
         weigh(problem.voxels, problem.points, T, problem.correspondence, problem.settings.variance, problem.weight)
@@ -160,12 +160,12 @@ def correspond(problem, T, reach: int, max_distance_m: float):
 
 @njit(nogil=True)
 def closest_pairs(problem, T, scale_m: float, source, closest, weight):
-    """Number of pairs; the point moved by T, the closest one on the surface of its voxel, and the weight of each.
+    """Number of correspondences; fills moved points, the closest ones on their voxels' surfaces, and weights.
 
-    The closest point is the foot on a plane or line (Besl & McKay 1992), of a voxel without a shape the mean.
+    The closest point is the projection to a plane or line (Besl & McKay 1992), or the mean without a shape.
     Correspondences are updated; weights are those of ``normal_equations``.
 
-    scale_m : s; source, closest (N, d), weight (N,) : room for the pairs, one row a pair
+    scale_m : s; source, closest (N, d), weight (N,) : filled, one row per correspondence
     """
     correspond(problem, T, problem.settings.reach, problem.settings.max_distance_m)
     cells, points = problem.voxels.cells, problem.points
@@ -194,7 +194,7 @@ def closest_pairs(problem, T, scale_m: float, source, closest, weight):
 
 @njit(nogil=True)
 def shape_information(problem, T):
-    """Information (k, k) of planes and lines at the pose T; voxels that have no shape lose their weight."""
+    """Information (k, k) of planes and lines at the pose T; weights of voxels without a shape are set to 0."""
     k = problem.prior.shape[0]
     for i in range(problem.points.shape[0]):
         voxel = problem.correspondence[i]
@@ -211,7 +211,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
 
     points : (N, d) meters of all scans, each in its own lidar frame; starts : (K + 1,) scan k is points[starts[k]
     : starts[k + 1]]; poses : (K, d+1, d+1)
-    prior : (k, k) information of each pose as it is, twists along the map's axes, times the variance of a residual
+    prior : (k, k) information of each initial pose, twists along the map's axes, times the variance of a residual
     least_share : of a scan's points with a correspondence, below which it does not fit
     """
     offset = np.zeros(prior.shape[0])
@@ -226,12 +226,12 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
 
 @njit(nogil=True)
 def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> bool:
-    """True if one step x (k,) was taken with the present correspondences; False where H is singular.
+    """True if one step x (k,) was taken with the current correspondences; False where H is singular.
 
-    Levenberg–Marquardt takes back a step that raises the cost and damps harder (Marquardt 1963), by a factor
-    that doubles each time; after one of gain ratio ρ it damps by λ · max(⅓, 1 − (2ρ − 1)³) (Nielsen 1999). x is
-    zero where no step lowers the cost any more. After a step by which a point moves further than slack_m, the
-    normal equations are left as they are: the caller associates again.
+    Levenberg–Marquardt rejects a step that raises the cost and increases the damping (Marquardt 1963), by a factor
+    that doubles each time; after a step of gain ratio ρ the damping is λ · max(⅓, 1 − (2ρ − 1)³) (Nielsen 1999). x
+    is zero where no step lowers the cost any more. After a step that moves a point further than slack_m, the
+    normal equations are not updated: the caller re-associates.
     """
     settings = problem.settings
     growth = 2.0
@@ -275,7 +275,7 @@ def _linearize(problem, scale_m: float, iterate):
 
 @njit(inline="always")
 def _evaluate(problem, scale_m: float, iterate):
-    """Fill the iterate's sums at its pose, and leave its normal equations as they are."""
+    """Fill the iterate's sums at its pose, without updating its normal equations."""
     cost, total_weight, squares = robust_sums(problem, iterate.T, scale_m)
     cost += _prior_cost(problem.prior, iterate.offset)
     iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
@@ -293,7 +293,7 @@ def _accept(now, trial):
 
 @njit(inline="always")
 def _copy(matrix, out):
-    """Copy a matrix by its entries: of an assignment Numba compiles a check of shapes, which takes seconds."""
+    """Copy a matrix by its entries: for an assignment, Numba compiles a shape check, which takes seconds."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] = matrix[i, j]
@@ -346,7 +346,7 @@ def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
     Newton              ξ = −H⁻¹b with the full Hessian; where that is indefinite the diagonal is raised
     Gauss–Newton        ξ = −(JᵀJ)⁻¹Jᵀr
     Levenberg–Marquardt ξ = −(JᵀJ + λ diag(JᵀJ))⁻¹Jᵀr (Marquardt 1963)
-    factor : (k, k), room for the factorization
+    factor : (k, k), buffer for the factorization
     """
     k = b.shape[0]
     if optimizer == GRADIENT_DESCENT:

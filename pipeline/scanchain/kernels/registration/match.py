@@ -22,11 +22,11 @@ from scanchain.kernels.registration.observability import (
 )
 from scanchain.kernels.registration.residuals import WITHOUT_KERNEL_M, gradient_spread, normal_equations
 
-_TURN_INFORMATION = 25.0  # rad⁻² of a turn that nothing determines
-_POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance counts for
-_UNSHARED = 0.5  # share of the variance of planar residuals that is not the map's, by NEES of simulated motions
-_POOLED = 0.02  # weight of the variance that all residuals have in common against that of each surface
-_SIGMAS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
+_TURN_INFORMATION = 25.0  # rad⁻², of an unconstrained rotation
+_POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance is weighted as
+_UNSHARED = 0.5  # share of the variance of planar residuals not due to the map, by NEES of simulated motions
+_POOLED = 0.02  # weight of the variance of all residuals against that of each surface
+_SIGMAS = 2.0  # initial kernel scale, in standard deviations of the prediction
 
 
 class Result(NamedTuple):
@@ -56,10 +56,10 @@ class Result(NamedTuple):
 def match(voxels, points, T_first, expected, settings):
     """``Result`` of points (N, d) aligned to a map from T_first (d+1, d+1), near a predicted pose.
 
-    The prior counts with its largest standard deviations. Where the scan constrains a direction weakly, it is
-    aligned once more, and along that direction the prior counts with its covariance. In the plane an extrapolated
-    motion does so only where there is no information at all: walls that look alike hold a robot that sets off
-    in a corridor better than the rest before; the motion that wheels measured is fused.
+    The prior is used with its largest standard deviations. Where the scan constrains a direction weakly, it is
+    aligned again, with the covariance of the prior along that direction. In the plane this applies to an
+    extrapolated motion only where there is no information at all: for a robot that starts to move in a corridor,
+    even ambiguous walls constrain it better than the standstill before; a motion measured by wheels is fused.
 
     expected : T_target_source (d+1, d+1), covariance (k, k) and widest (k,) as in ``Prior``; without a prediction
         T_first, zeros and infinite
@@ -103,9 +103,9 @@ def match(voxels, points, T_first, expected, settings):
 
 @njit(nogil=True)
 def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
-    """``Result`` at T (d+1, d+1), which another method found without the prediction.
+    """``Result`` at T (d+1, d+1), found by another method without the prediction.
 
-    Along weak directions the pose moves, in place, to the predicted one, as far as the prior of ``match`` says.
+    Along weak directions the pose is moved, in place, towards the predicted one, as the prior in ``match`` does.
     iterations, ending : of that method
     """
     k = 3 if points.shape[1] == 2 else 6
@@ -134,9 +134,9 @@ def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
 
 @njit(nogil=True)
 def _result(problem, T, T_first, fit, last, spectrum, spread):
-    """``Result`` in the source's own frame: information by ``fit``, quality by the ``last`` correspondences.
+    """``Result`` in the source's own frame: information from ``fit``, quality from the ``last`` correspondences.
 
-    spread : (k, k) covariance of the gradient, empty to have one variance for all residuals
+    spread : (k, k) covariance of the gradient, empty to use one variance for all residuals
     """
     unweighted, b = np.empty_like(last.H), np.empty(last.H.shape[0])
     normal_equations(problem, T, WITHOUT_KERNEL_M, 0.0, unweighted, b)
@@ -169,9 +169,9 @@ def _result(problem, T, T_first, fit, last, spectrum, spread):
 
 @njit(nogil=True)
 def _spread(problem, T, fit):
-    """Covariance (6, 6) of the gradient at T, by which each surface errs as its residuals say; empty in the plane.
+    """Covariance (6, 6) of the gradient at T, with an error per surface as by its residuals; empty in the plane.
 
-    The variance of all residuals counts for a part as well: few surfaces fit by chance.
+    A share of the variance of all residuals is added: few surfaces may fit by chance.
     """
     if fit.H.shape[0] == 3:
         return np.zeros((0, 0))
@@ -185,9 +185,9 @@ def _spread(problem, T, fit):
 
 @njit(inline="always")
 def _variance_factor(problem, fit) -> float:
-    """Variance that residuals do not share with the next scan's, over that which the information counts.
+    """Variance of residuals that is not shared with the next scan, over the variance used for the information.
 
-    Pooled with some residuals of the sensor's variance: few fit by chance.
+    Pooled with the sensor's variance: few residuals may be small by chance.
     """
     pooled = fit.squares + _POOLED_RESIDUALS * problem.settings.variance
     variance = _UNSHARED * pooled / (fit.total_weight + _POOLED_RESIDUALS)
@@ -196,10 +196,10 @@ def _variance_factor(problem, fit) -> float:
 
 @njit(inline="always")
 def _systematic(problem, T, T_first, fit, gradients):
-    """Covariance (k, k) in the source's own frame by how the gradients b_s (8, k) of sectors differ.
+    """Covariance (k, k) in the source's own frame from the differences of the gradients b_s (8, k) of sectors.
 
-    H⁻¹ (Σ b_s b_sᵀ) H⁻¹ G / (G − 1) of G sectors with correspondences, H with the prior (cluster-robust
-    covariance, as ``gradient_spread``). Directions that neither determines are known to a meter and 0.2 rad.
+    H⁻¹ (Σ b_s b_sᵀ) H⁻¹ G / (G − 1) for G sectors with correspondences, H with the prior (cluster-robust
+    covariance, as ``gradient_spread``). Unconstrained directions are bounded to 1 m and 0.2 rad.
     """
     k, H, groups = fit.H.shape[0], fit.H + problem.prior, 0
     for m in range(k):
@@ -221,7 +221,7 @@ def _systematic(problem, T, T_first, fit, gradients):
 
 @njit(inline="always")
 def _variance(problem, fit) -> float:
-    """Variance of a residual, by the fit, or the sensor's where the fit is closer than that; m²."""
+    """Variance of a residual: that of the fit, at least the sensor's; m²."""
     return max(problem.settings.variance, _residual_of(fit) ** 2)
 
 
@@ -233,7 +233,7 @@ def _residual_of(fit) -> float:
 
 @njit(inline="always")
 def _about_target(information, T, variance: float):
-    """Information (k, k) about twists in the source's frame, times a variance, as that along the target's axes."""
+    """Information (k, k) about twists in the source's frame, times a variance, along the target's axes."""
     out = congruent(adjoint(inverse(centered(T, T))), information)
     for i in range(out.shape[0]):
         for j in range(out.shape[0]):

@@ -21,17 +21,17 @@ from scanchain.kernels.voxels import (
     unpack,
 )
 
-WEAK = 10.0  # times the limits of a degenerate direction, below which the prior counts along a direction
-_FIXED = 1e3  # times the information of all residuals, of the prior along a degenerate direction
+WEAK = 10.0  # times the limits of a degenerate direction, below which the prior is used along a direction
+_FIXED = 1e3  # information of the prior along a degenerate direction, times that of all residuals
 _ROUNDING = 1e-12  # of the largest eigenvalue, below which one is zero
-_OLD = 2  # insertions since a voxel's first, from which on it counts as independent of the present scan
+_OLD = 2  # insertions since a voxel's first, after which it counts as independent of the current scan
 
 
 class Spectrum(NamedTuple):
     """Observability by direction, about the problem's origin and along the map's axes.
 
     scale : (k,) of units: rotations count as the lengths they move a point at the scan's root mean square range
-    values : (k,) eigenvalues, ascending, of the information per weight; 1 is a direction that every residual sees
+    values : (k,) eigenvalues, ascending, of the information per weight; 1 if every residual constrains it fully
     vectors : (k, k) unit eigenvectors, a column each, in scaled units
     signals : (k,) signal-to-noise ratio along each; infinite where not computed
     """
@@ -70,8 +70,8 @@ def agreement(H, unweighted, range_m: float) -> float:
 
     The smallest eigenvalue of H x = λ U x, with H and U (k, k) the information with and without robust weights:
     near 1 where the correspondences along every direction agree with the pose, low where those that constrain a
-    direction contradict it, however many others (the ground, as a rule) fit. Directions without information are
-    left out; 0 where there is none at all.
+    direction contradict it, however many others (usually the ground) fit. Directions without information are
+    ignored; 0 without any information.
     """
     k = H.shape[0]
     plain = spectrum_of(unweighted, 1.0, range_m)
@@ -97,21 +97,22 @@ def agreement(H, unweighted, range_m: float) -> float:
 
 @njit(inline="always")
 def is_below(spectrum, m: int, times: float, settings) -> bool:
-    """True if direction m lies below so many times the limits of a degenerate one."""
+    """True if direction m is below ``times`` the limits of a degenerate one."""
     is_blind = spectrum.values[m] < times * settings.min_information
     return is_blind or spectrum.signals[m] < times * settings.min_signal
 
 
 @njit(nogil=True)
 def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings):
-    """Information (k, k), times the variance of a residual, of the prior along the weak directions alone.
+    """Information (k, k), times the variance of a residual, of the prior, along weak directions only.
 
-    Along degenerate directions the pose does not move at all (solution remapping; Zhang, Kaess & Singh 2016).
-    Up to WEAK times the limits the prior's own information ``believed`` (k, k) counts, against that of the
-    residuals without its noise-induced part: the share 1 − 1/signal. Stronger directions have no prior: a vehicle
-    that brakes may contradict any prediction.
-    is_fused : True to fuse a measured motion, along degenerate directions alone: the pose moves by as much as the
-        information that is not noise-induced says against it
+    Along degenerate directions the pose is constrained to the prior (solution remapping; Zhang, Kaess & Singh
+    2016).
+    Up to WEAK times the limits, the prior has its own information ``believed`` (k, k), against that of the
+    residuals without its noise-induced part: the share 1 − 1/signal. Stronger directions have no prior: a braking
+    vehicle may contradict any prediction.
+    is_fused : True to fuse a measured motion, along degenerate directions only, weighted against the information
+        of the residuals that is not noise-induced
     """
     k = believed.shape[0]
     prior, twist = np.zeros((k, k)), np.empty(k)
@@ -135,7 +136,7 @@ def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings
 
 @njit(inline="always")
 def remove_noise(spectrum, H, total_weight: float, settings):
-    """Take the noise-induced part along weak directions from the information H (k, k) of residuals.
+    """Subtract the noise-induced part along weak directions from the information H (k, k) of residuals.
 
     Along a direction of signal-to-noise ratio s, the share 1/s of the information is noise-induced.
     """
@@ -148,7 +149,7 @@ def remove_noise(spectrum, H, total_weight: float, settings):
 
 @njit(inline="always")
 def _add_along(spectrum, m: int, amount: float, H):
-    """Add so much information along direction m to H (k, k)."""
+    """Add this amount of information along direction m to H (k, k)."""
     for i in range(H.shape[0]):
         for j in range(H.shape[0]):
             along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
@@ -157,7 +158,7 @@ def _add_along(spectrum, m: int, amount: float, H):
 
 @njit(inline="always")
 def add_signals(problem, T, spectrum):
-    """Fill the spectrum's signals, from the weakest direction on to the first that is not weak."""
+    """Fill the spectrum's signals, from the weakest direction to the first that is not weak."""
     twist = np.empty(spectrum.values.shape[0])
     for m in range(spectrum.values.shape[0]):
         _twist_of(spectrum, m, twist)
@@ -170,14 +171,14 @@ def add_signals(problem, T, spectrum):
 def signal_along(problem, T, twist) -> float:
     """Signal-to-noise ratio of the information along a twist (k,) (after Hatleskog & Alexis 2024).
 
-    A normal n that was fitted to m points, of variance τ² about their plane and with eigenvalues λ' along u and λ
-    along v, is off by some δ. A correspondence of weight w, which the twist displaces by d, then has, on average,
-    the noise-induced information
+    A normal n fitted to m points, with variance τ² about their plane and eigenvalues λ' along u and λ along v, has
+    an error. A correspondence of weight w, displaced by d under the twist, therefore has, on average, the
+    noise-induced information
         w τ²/m ((u·d)²/λ' + (v·d)²/λ)
-    whether the direction is observable or not: where it is not, the ratio is about 1, or below.
+    whether the direction is observable or not: where it is not, the ratio is about 1 or less.
     The informative voxels must be independent of the scan and of each other. Where the field of view ends, the
-    points of a few rings form walls that face the lidar and move along with it. So the voxel with most information
-    does not count, nor its neighbors, nor voxels that are new in the map, as far as it has older ones.
+    points of a few rings form apparent walls that face the lidar and move along with it. So the most informative
+    voxel and its neighbors are ignored, and so are voxels that are new in the map, if it has older ones.
 
     T (d+1, d+1) : pose at which the problem's points were associated
     """
@@ -185,7 +186,7 @@ def signal_along(problem, T, twist) -> float:
     insertions = problem.settings.insertions
     parameters = 2.0 if points.shape[1] == 2 else 3.0
     informative = np.zeros(points.shape[0])
-    total, noise, most, dominant = 0.0, 0.0, 0.0, np.int64(-1)  # no literal, or else all is compiled twice
+    total, noise, most, dominant = 0.0, 0.0, 0.0, np.int64(-1)  # a literal would compile it twice
     youngest = insertions - min(_OLD, insertions - 1)
     for i in range(points.shape[0]):
         voxel, weight = problem.correspondence[i], problem.weight[i]
@@ -216,7 +217,7 @@ def signal_along(problem, T, twist) -> float:
 
 @njit(inline="always")
 def _normal_variance(cells, voxel: int, dx, dy, dz, beside: float, parameters: float) -> float:
-    """Variance of n·d by the fit of a voxel's normal n, ``beside`` being the squared length of d within the plane.
+    """Variance of n·d by the fit of a voxel's normal n, ``beside`` the squared length of d within the plane.
 
     τ² is estimated from m points less the parameters of the fit.
     """
@@ -242,7 +243,7 @@ def _sum_around(voxels, voxel: int, correspondence, informative) -> float:
 
 @njit(inline="always")
 def seen_from_source(T, T_first, H, direction, variance: float):
-    """Information (k, k) and a direction (k,) of twists, in the source's own frame.
+    """Information (k, k) and a direction (k,) of twists, transformed to the source's own frame.
 
     H (k, k), of residuals with this variance, and the direction are about the position of T_first, in map axes.
     """

@@ -1,4 +1,4 @@
-"""Plane adjustment: planes that several scans see, and equations of their poses and of an elevation offset."""
+"""Plane adjustment: planes seen by several scans, and normal equations of poses and an elevation offset."""
 
 import math
 
@@ -8,19 +8,19 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.matrices import eigenvalues_3d, eigenvector_3d, factorize
 from scanchain.kernels.voxels import add_moments, covariance_of, find_row, key_of, move
 
-_FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in a cell that counts as a plane, and of scans that see it
+_FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in the cell of a plane, and of scans that see it
 _THIN, _FLAT, _WIDE = 0.02, 0.15, 0.1  # of a plane: ratio of its variances, largest and least deviation in cells
 
-_LEAST_SLOPE = 0.4  # of Σψ' over Σw, which bounds how much longer steps become
+_LEAST_SLOPE = 0.4  # least ratio of Σψ' to Σw, which limits the extension of steps
 
 
 @njit(nogil=True)
 def planes(points, number, poses, cell_m: float, beside, residual, plane, normals):
-    """Find the cells of a grid whose points, of several scans, lie in a plane; returns how many, P.
+    """Find the cells of a grid whose points, from several scans, lie in a plane; returns their number P.
 
-    points : (N, 3) of lidar frames, by scans; number : (N,) of the scan of each; poses (K, 4, 4)
-    Filled are plane (N,), the number of the plane of each point, −1 outside; beside (N, 3), from the plane's mean,
-    and residual (N,), along its normal; the first P rows of normals (N, 3), unit.
+    points : (N, 3) in lidar frames, by scans; number : (N,) scan of each; poses (K, 4, 4)
+    Filled are plane (N,), the index of the plane of each point, −1 without one; beside (N, 3), its offset from the
+    plane's mean, and residual (N,), that offset along the normal; the first P rows of normals (N, 3), unit.
     """
     n, slots = points.shape[0], 2
     while slots < 2 * n:
@@ -62,7 +62,7 @@ def planes(points, number, poses, cell_m: float, beside, residual, plane, normal
 
 @njit(inline="always")
 def _from_mean(sums, cell: int, normals, p: int, beside, i: int) -> float:
-    """Distance of a point from its plane; the point becomes that from the plane's mean."""
+    """Distance of a point from its plane; the point becomes its offset from the plane's mean."""
     residual = 0.0
     for axis in range(3):
         beside[i, axis] -= sums[cell, 1 + axis] / sums[cell, 0]
@@ -72,7 +72,7 @@ def _from_mean(sums, cell: int, normals, p: int, beside, i: int) -> float:
 
 @njit(inline="always")
 def _is_plane(sums, cell_m: float, normal) -> bool:
-    """True if points of these sums lie in a plane, whose normal (3,) is written."""
+    """True if points with these moments lie in a plane, whose normal (3,) is written."""
     xx, xy, xz, yy, yz, zz = covariance_of(sums)
     small, middle, _ = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
     if small >= min(_THIN * middle, (_FLAT * cell_m) ** 2) or middle <= (_WIDE * cell_m) ** 2:
@@ -83,15 +83,15 @@ def _is_plane(sums, cell_m: float, normal) -> bool:
 
 @njit(nogil=True)
 def plane_equations(points, number, plane, beside, residual, normals, poses, scale_m: float, H):
-    """Add up the normal equations of poses and offset; returns what scales H⁻¹ to a covariance, and a step.
+    """Sum up the normal equations of poses and offset; returns the factors on H⁻¹ for covariance and step.
 
     With p the raised point of scan k in a plane of unit normal n and mean x̄, and a = R_kᵀ n, T_k ← T_k exp(ξ) and
     an elevation raised by δ change the residual r = nᵀ(T_k p − x̄) by aᵀρ + (p × a)ᵀφ + aᵀ(∂p/∂δ) δ. The plane,
-    height and two slopes, is free: its Schur complement is subtracted. Weights w = (1 + (r/s)²)⁻² of Geman and
-    McClure (1985) with ψ = w r, of which least squares take w for the slope ψ' = (1 − 3 (r/s)²) / (1 + (r/s)²)³:
+    height and two slopes, is estimated too: its Schur complement is subtracted. Weights w = (1 + (r/s)²)⁻² (Geman
+    & McClure 1985) with ψ = w r. Least squares use w instead of the slope ψ' = (1 − 3 (r/s)²) / (1 + (r/s)²)³:
     their step is too short by Σψ'/Σw, and the variance is Σψ² Σw / (Σψ')² (Huber 1964).
 
-    points : (N, 3) of lidar frames, raised; number, plane, residual (N,), beside (N, 3), normals (P, 3) of planes
+    points : (N, 3) in lidar frames, raised; number, plane, residual (N,), beside (N, 3), normals (P, 3) of planes
     H (6K + 2, 6K + 2) : zeros, filled; the gradient in its last column
     """
     count, size, total, squares, slopes = normals.shape[0], H.shape[0], 0.0, 0.0, 0.0
@@ -156,7 +156,7 @@ def _unfold(among, H):
 def _terms(beside, residual, i: int, normals, p: int, g):
     """Write the derivative (3,) of a plane at a point by its parameters, height and slopes along two axes.
 
-    Where the point is projected to the plane, so that turns of all poses together are slopes and no more.
+    Taken at the point's projection to the plane, so that a common turn of all poses changes slopes only.
     """
     x, y, z = abs(normals[p, 0]), abs(normals[p, 1]), abs(normals[p, 2])
     across = 0 if x >= max(y, z) else 1 if y >= z else 2

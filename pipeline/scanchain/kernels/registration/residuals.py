@@ -9,7 +9,7 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels import LINE, PLANE, POINT, Voxels, move, shape_of
 
 WITHOUT_KERNEL_M = 1e100  # scale at which every robust weight is one
-_SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio, which scatters rows that follow each other (Knuth)
+_SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio: hashes consecutive rows far apart (Knuth)
 
 
 class Settings(NamedTuple):
@@ -17,13 +17,13 @@ class Settings(NamedTuple):
 
     reach, max_distance_m : of the search for correspondences while the pose moves
     last_reach, last_distance_m : of the correspondences that the result is judged by
-    first_scale_m, widest_scale_m, scale_m : of the robust kernel, at first where the prediction is certain, at
-        most where it is not, and at last
+    first_scale_m, widest_scale_m, scale_m : of the robust kernel: initial one for a certain prediction, largest
+        one for an uncertain one, final one
     variance : of a range, σ² in m²
     min_information, min_signal : eigenvalue of the information per weight, and its signal-to-noise ratio, below
         which a direction is degenerate
     insertions : into the map so far
-    tolerance_m, tolerance_rad : of a step at a minimum
+    tolerance_m, tolerance_rad : largest step of a converged pose
     """
 
     optimizer: int
@@ -67,14 +67,14 @@ def normal_equations(problem, T, scale_m: float, curvature: float, H, b):
     """Normal equations of all residuals at T, written to H (k, k) and b (k,).
 
     With p a point moved by T, q the mean of its voxel and n the normal there, a left twist ξ = (ρ, φ) about the
-    problem's origin (all lengths counted from there, so that rotation and translation stay apart), T ← exp(ξ) T,
+    problem's origin (all lengths relative to it, so that rotation and translation decouple), T ← exp(ξ) T,
     changes the residual by
         r = nᵀ(p − q)        ∂r/∂ξ = [nᵀ, (p × n)ᵀ]     (Chen & Medioni 1992; in 2D Censi 2008)
-    On a line the residuals are the two across it, on a point shape all components of p − q. Geman–McClure
+    For a line the residuals are the two across it, for a point shape all components of p − q. Geman–McClure
     weighs each by w = (s² / (s² + r²))², r² the squared length of the residual (Geman & McClure 1985) times
     the weight of the correspondence.
 
-    scale_m : s; residuals far above it are all but ignored
+    scale_m : s; residuals far above it are practically ignored
     curvature : 1 adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
         held fixed); 0 leaves it out
     H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
@@ -107,10 +107,10 @@ def gradients_by_group(problem, T, scale_m: float, group, gradients):
 
 @njit(inline="always")
 def gradient_spread(problem, T, scale_m: float):
-    """Covariance (6, 6) of b in ``normal_equations``, by how b differs from voxel to voxel: Σ b_v b_vᵀ.
+    """Covariance (6, 6) of b in ``normal_equations``, from its contributions per voxel: Σ b_v b_vᵀ.
 
     Points with a correspondence in one voxel share the error of its plane, so that only their sums b_v are
-    independent (cluster-robust covariance; Liang & Zeger 1986). Smooth floors then say more than rough walls.
+    independent (cluster-robust covariance; Liang & Zeger 1986). Smooth floors then count more than rough walls.
     """
     size = 64
     while size < 2 * problem.points.shape[0]:
@@ -136,7 +136,7 @@ def gradient_spread(problem, T, scale_m: float):
 
 @njit(inline="always")
 def _arrays(problem, T):
-    """What loops over the points take: of arrays in a tuple, references are counted at every point."""
+    """Arguments of loops over the points: arrays in a tuple would cost reference counting at every point."""
     return problem.voxels.cells, problem.points, T, problem.origin, problem.correspondence, problem.weight
 
 
@@ -144,8 +144,8 @@ def _arrays(problem, T):
 def _sum_up(cells, points, T, origin, correspondence, weight, scale_m: float, upper, gradient):
     """Cost, Σ w and Σ w r², then the sums over all residuals: the upper triangle of H, by rows, and b.
 
-    upper, gradient : zeros, 21 and 6 in space, 6 and 3 in the plane, none to leave the two out. Tuples are kept in
-    registers; in arrays, every addition waits until the one before is stored.
+    upper, gradient : zeros, 21 and 6 in space, 6 and 3 in the plane, empty to skip both. Tuples are kept in
+    registers; in arrays, every addition would wait for the previous store.
     """
     cost = total_weight = squares = 0.0
     s2 = scale_m * scale_m
@@ -241,7 +241,7 @@ def _residual(shape, q, normal, x, y, z):
 
 @njit(forceinline=True)
 def _plus(h, b, w, shape, normal, moved, residual, along):
-    """Upper triangle h, by rows, and gradient b with one correspondence of weight w; as they are if empty."""
+    """Upper triangle h, by rows, and gradient b plus one correspondence of weight w; unchanged if empty."""
     if len(b) == 6:
         return _plus_in_space(h, b, w, shape, normal, moved, residual, along)
     elif len(b) == 3:
@@ -252,7 +252,7 @@ def _plus(h, b, w, shape, normal, moved, residual, along):
 
 @njit(forceinline=True)
 def _plus_in_space(h, b, w, shape, normal, moved, residual, along):
-    """Upper triangle h (21), by rows, and gradient b (6) with one correspondence of weight w, by its shape."""
+    """Upper triangle h (21), by rows, and gradient b (6) plus one correspondence of weight w, by its shape."""
     if shape != PLANE:
         h, b = _plus_point(h, b, w, moved, residual)
         w, along = -w, 0.0
@@ -263,7 +263,7 @@ def _plus_in_space(h, b, w, shape, normal, moved, residual, along):
 
 @njit(forceinline=True)
 def _plus_plane(h, b, w, moved, normal, r):
-    """Upper triangle h (21), by rows, and gradient b (6) with one residual: J = [n, p × n]."""
+    """Upper triangle h (21), by rows, and gradient b (6) plus one residual: J = [n, p × n]."""
     (px, py, pz), (nx, ny, nz) = moved, normal
     cx, cy, cz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
     wx, wy, wz, wcx, wcy, wcz, wr = w * nx, w * ny, w * nz, w * cx, w * cy, w * cz, r * w
@@ -280,7 +280,7 @@ def _plus_plane(h, b, w, moved, normal, r):
 
 @njit(forceinline=True)
 def _plus_point(h, b, w, moved, residual):
-    """Upper triangle h (21), by rows, and gradient b (6) with three residuals: J = [I, −p×]."""
+    """Upper triangle h (21), by rows, and gradient b (6) plus three residuals: J = [I, −p×]."""
     (px, py, pz), (ex, ey, ez) = moved, residual
     upper = (
         h[0] + w, h[1], h[2], h[3], h[4] + w * pz, h[5] - w * py,
@@ -296,7 +296,7 @@ def _plus_point(h, b, w, moved, residual):
 
 @njit(forceinline=True)
 def _plus_in_plane(h, b, w, shape, normal, moved, residual, r):
-    """Upper triangle h (6), by rows, and gradient b (3) with one correspondence of weight w.
+    """Upper triangle h (6), by rows, and gradient b (3) plus one correspondence of weight w.
 
     Point-to-line: J = [n, p × n]; point-to-point: J = [I, (−p_y, p_x)ᵀ].
     """

@@ -214,9 +214,9 @@ def _copy_rows(counts: Counter[str], file: Path, copy: Path) -> None:
             for name, sql in old.execute(_TABLES).fetchall():
                 new.execute(sql)
                 ends = list[int]()
-                for sought in ("NOT INDEXED", "INDEXED BY timestamp_idx"):
+                for index in ("NOT INDEXED", "INDEXED BY timestamp_idx"):
                     with suppress(sqlite3.Error):
-                        ends += [end for (end,) in old.execute(f"SELECT max(rowid) FROM {name} {sought}") if end]
+                        ends += [end for (end,) in old.execute(f"SELECT max(rowid) FROM {name} {index}") if end]
                 counts["stated"] += max(ends, default=0) if name == "messages" else 0
                 marks = ", ".join("?" for _ in old.execute(f"SELECT * FROM {name} LIMIT 0").description)
                 rows = _rows(old, name, max(ends, default=file.stat().st_size // _ROW_BYTES))

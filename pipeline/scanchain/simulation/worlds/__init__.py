@@ -17,10 +17,10 @@ from scanchain.simulation.worlds import indoor, outdoor
 class World:
     """A world, the route through it, the vehicle, and the default lidar and duration.
 
-    build : draws the place
-    route : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
-    sight_m : how far any lidar sees there
-    dropouts : places (x, y) in meters; for 1 s around the moment they are first passed, the log lacks its scans
+    build : builds the solids with random numbers
+    route : the closed route driven, (W, 2) along the ground or (W, 3) with given heights, or turns and moves
+    sight_m : visibility, an upper limit of any lidar's range
+    dropouts : positions (x, y) in meters; for 1 s around the first pass of each, no scans are recorded
     """
 
     build: Callable[[np.random.Generator], Solids]
@@ -32,7 +32,7 @@ class World:
     dropouts: tuple[tuple[float, float], ...] = ()
 
 
-_GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle of a street
+_GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing where the car turns, the middle of a street
 
 WORLDS: dict[str, World] = {
     "office": World(indoor.office, indoor.OFFICE_ROUTE, indoor.OFFICE_ROBOT, "lms-270", 240.0),

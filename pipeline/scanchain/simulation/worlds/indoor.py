@@ -1,9 +1,9 @@
 """Worlds inside of buildings: an office, an identical floor, a corridor, a hall, a stairwell.
 
-The office has rooms along a corridor that runs in a ring around a core; the identical floor three corridors of
-identical rooms, which scans do not tell apart. The corridor is 80 m long with bare walls between two lobbies: in
+The office has rooms along a corridor that runs in a ring around a core; the identical floor has three corridors of
+identical rooms, which are perceptually aliased. The corridor is 80 m long with bare walls between two lobbies: in
 its middle the motion along it is unobservable. The hall is large, with few pillars; the stairwell has four storys
-and is walked up and down with the lidar in the hand.
+and is walked up and down with a handheld lidar.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scanchain.data import Matrix
 from scanchain.simulation.motion import Vehicle, mount, sampled
 from scanchain.simulation.solids import Scenery, Solids
 
-# walls with doorways, and furniture put where there is room
+# walls with doorways, and furniture where it fits
 
 _CEILING_M = 2.8
 _WALL_M, _DOOR_M = 0.12, 1.0
@@ -33,7 +33,7 @@ _SIZES_M = {
 
 
 class Wall(NamedTuple):
-    """A wall with doorways ``doors`` meters along it; the leaves open to its left (1), right (−1) or are off."""
+    """A wall with doorways ``doors`` meters along it; leaves open to its left (1), right (−1) or are off (0)."""
 
     x0: float
     y0: float
@@ -43,13 +43,13 @@ class Wall(NamedTuple):
     leaves: int = 0
 
     def at(self, along_m: float, left_m: float = 0.0) -> tuple[float, float]:
-        """The position so far along the wall and to its left."""
+        """The position ``along_m`` along the wall and ``left_m`` to its left."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return float(self.x0 + c * along_m - s * left_m), float(self.y0 + s * along_m + c * left_m)
 
     @property
     def length_m(self) -> float:
-        """From end to end."""
+        """Length from end to end."""
         return float(np.hypot(self.x1 - self.x0, self.y1 - self.y0))
 
     @property
@@ -78,8 +78,8 @@ def build_wall(scenery: Scenery, wall: Wall, rng: np.random.Generator) -> None:
 def furnish(scenery: Scenery, rooms: Matrix, route: Matrix, doors: Matrix, rng: np.random.Generator) -> None:
     """Fill rooms at random: shelves along the walls, a desk for every 5 m², bins and a plant.
 
-    What finds no room after a few tries is left out.
-    rooms : (R, 4) rectangles between the middles of their walls: low x, low y, high x, high y
+    A piece that does not fit after a few tries is left out.
+    rooms : (R, 4) rectangles between the centerlines of their walls: low x, low y, high x, high y
     route, doors : (N, 2) positions that are kept free
     """
     taken: list[Matrix] = []  # center and half size, (2, 2)
@@ -104,7 +104,7 @@ def furnish(scenery: Scenery, rooms: Matrix, route: Matrix, doors: Matrix, rng: 
 
 
 def _is_free(center: Matrix, half: Matrix, taken: list[Matrix], route: Matrix, doors: Matrix) -> bool:
-    """True if an upright rectangle overlaps no other one and leaves the route and the doorways free."""
+    """True if an axis-aligned rectangle overlaps no other one and leaves the route and the doorways free."""
     if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in taken):
         return False
     kept_free = ((route, _ROUTE_M), (doors, _DOORWAY_M))
@@ -148,7 +148,7 @@ OFFICE_ROBOT = Vehicle(
     radius_m=0.25, T_base_lidar=mount(0.15, 0.25),
 )  # fmt: skip
 
-# Round the ring by two rooms; then again, across the core, and by two more rooms.
+# Around the ring through two rooms; then again, across the core, and through two more rooms.
 OFFICE_ROUTE = np.array([
     [5.0, 5.0], [8.0, 5.0], [8.0, 2.0], [13.0, 2.0], [13.0, 5.0], [21.0, 5.0], [21.0, 13.0], [5.0, 13.0],
     [5.0, 5.0], [21.0, 5.0], [21.0, 13.0], [12.7, 13.0], [12.7, 5.0], [21.0, 5.0], [21.0, 13.0], [17.0, 13.0],
@@ -175,7 +175,7 @@ _ROOMS = np.array([
 
 
 def office(rng: np.random.Generator) -> Solids:
-    """The floor; walls and doorways stand where they stand, furniture and door leaves are drawn from ``rng``."""
+    """The floor; walls and doorways are fixed, furniture and door leaves are sampled from ``rng``."""
     scenery = Scenery()
     scenery.box((13.0, 9.0), (27.0, 19.0), (_CEILING_M, _CEILING_M + 0.2))
     for wall in _WALLS:
@@ -204,11 +204,11 @@ def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
 
 _ROOMS_A_SIDE, _ROOM_M, _ROOM_DEPTH_M = 8, 5.0, 6.0  # on each side of a corridor, along it and across it
 _FLOOR_M = _ROOMS_A_SIDE * _ROOM_M
-_AISLE_HALF_M = 1.0  # of a corridor's width
+_AISLE_HALF_M = 1.0  # half the width of a corridor
 _CORRIDORS_Y_M = (0.0, 14.0, 28.0)  # their middles; rooms lie back to back between them
 _WEST_M, _EAST_M = -_AISLE_HALF_M, _FLOOR_M + _AISLE_HALF_M  # middles of the two corridors that join them
 
-# Along each corridor and through rooms of each, back through the first one, and round by two rooms to the start.
+# Along each corridor and through rooms of each, back through the first one, and through two rooms to the start.
 IDENTICAL_ROUTE = np.array([
     [7.5, 0.0], [27.5, 0.0], [27.5, -4.0], [32.5, -4.0], [32.5, 0.0], [_EAST_M, 0.0], [_EAST_M, 14.0],
     [22.5, 14.0], [22.5, 10.0], [17.5, 10.0], [17.5, 14.0], [_WEST_M, 14.0], [_WEST_M, 28.0], [7.5, 28.0],
@@ -216,7 +216,7 @@ IDENTICAL_ROUTE = np.array([
     [27.5, -4.0], [27.5, 0.0], [12.5, 0.0], [12.5, 4.0], [7.5, 4.0],
 ])  # fmt: skip
 
-# In every room: middle of a piece of furniture, from the room's, and how long, wide and high it is.
+# In every room: center of a piece of furniture relative to the room's, its length, width and height.
 _FURNITURE_M = np.array([
     [1.7, 2.4, 1.4, 0.8, 0.74], [1.5, 1.6, 0.45, 0.45, 0.9], [-1.75, 2.65, 1.2, 0.4, 1.9],
     [-2.15, -1.8, 0.4, 1.2, 1.2], [2.15, -2.0, 0.5, 0.6, 2.0],
@@ -224,7 +224,7 @@ _FURNITURE_M = np.array([
 
 
 def identical(rng: np.random.Generator) -> Solids:
-    """The floor; what ``rng`` draws is the same in all rooms."""
+    """The floor; what is sampled from ``rng`` is the same in all rooms."""
     furniture = _FURNITURE_M + rng.uniform(-0.1, 0.1, _FURNITURE_M.shape)
     scenery = Scenery()
     middle = (0.5 * _FLOOR_M, _CORRIDORS_Y_M[1])
@@ -255,7 +255,7 @@ def identical(rng: np.random.Generator) -> Solids:
 
 CORRIDOR_M = 80.0
 CORRIDOR_SIGHT_M = 20.0  # range limit by dust in the air: neither end can be seen from the middle
-CORRIDOR_STRUCTURE_M = 5.0  # of the corridor at either end that is not bare
+CORRIDOR_STRUCTURE_M = 5.0  # length at either end of the corridor where its walls are not bare
 _CORRIDOR_HALF_M, _CORRIDOR_HEIGHT_M, _CORRIDOR_WALL_M = 1.5, 2.7, 0.3
 _LOBBY_M, _LOBBY_HALF_M = 9.0, 4.5
 
@@ -264,7 +264,7 @@ CORRIDOR_ROBOT = Vehicle(
     sway_rad=0.004, heave_m=0.004, radius_m=0.35, T_base_lidar=mount(0.1, 0.9),
 )  # fmt: skip
 
-# To the other lobby on the right, round in it, and back.
+# To the other lobby, keeping right, around in it, and back.
 CORRIDOR_ROUTE = np.array([
     [-3.0, -0.4], [83.0, -0.4], [84.5, -2.2], [86.5, -2.0], [86.5, 2.0], [84.5, 2.2], [83.0, 0.4],
     [-3.0, 0.4], [-4.5, 2.2], [-6.5, 2.0], [-6.5, -2.0], [-4.5, -2.2],
@@ -272,7 +272,7 @@ CORRIDOR_ROUTE = np.array([
 
 
 def corridor(rng: np.random.Generator) -> Solids:
-    """The corridor along x from 0 to 80 m; what stands in the lobbies and at the ends is drawn from ``rng``."""
+    """The corridor along x from 0 to 80 m; what stands in the lobbies and at the ends is sampled from ``rng``."""
     scenery = Scenery()
     middle, span = 0.5 * CORRIDOR_M, CORRIDOR_M + 2.0 * _LOBBY_M + 2.0
     scenery.box((middle, 0.0), (span, 2.0 * _LOBBY_HALF_M + 2.0), (_CORRIDOR_HEIGHT_M, _CORRIDOR_HEIGHT_M + 0.3))
@@ -332,7 +332,7 @@ HALL_ROUTE = np.array([[12.0, 9.0], [51.0, 9.0], [51.0, 31.0], [9.0, 31.0], [9.0
 
 
 def hall(rng: np.random.Generator) -> Solids:
-    """Walls, ceiling, three pillars in a row and four stacks of pallets drawn from ``rng``."""
+    """Walls, ceiling, three pillars in a row and four stacks of pallets sampled from ``rng``."""
     scenery = Scenery()
     middle = (0.5 * _HALL_LENGTH_M, 0.5 * _HALL_WIDTH_M)
     scenery.box(middle, (_HALL_LENGTH_M + 2.0, _HALL_WIDTH_M + 2.0), (_HALL_HEIGHT_M, _HALL_HEIGHT_M + 0.3))
@@ -354,7 +354,7 @@ def hall(rng: np.random.Generator) -> Solids:
 _FLIGHTS, _STEPS_A_FLIGHT = 8, 10
 _TREAD_M, _RISE_M = 0.29, 0.17
 _RUN_M, _FLIGHT_M = _STEPS_A_FLIGHT * _TREAD_M, _STEPS_A_FLIGHT * _RISE_M
-_LANE_M, _STAIR_HALF_M, _LANDING_M = 0.8, 1.6, 1.7  # of a flight's middle, half the width, depth of a landing
+_LANE_M, _STAIR_HALF_M, _LANDING_M = 0.8, 1.6, 1.7  # offset of a flight, half the width, depth of a landing
 _TOP_M = _FLIGHTS * _FLIGHT_M
 _ROOF_M = _TOP_M + 2.8
 
@@ -365,7 +365,7 @@ WALKER = Vehicle(
 
 
 def _staircase_route() -> Matrix:
-    """Up all flights, round on the top landing, down again, and round on the ground; heights of the feet."""
+    """Up all flights, around on the top landing, down again, and around on the ground; heights of the feet."""
     up = []
     for flight in range(_FLIGHTS):
         y = -_LANE_M if flight % 2 == 0 else _LANE_M
@@ -373,7 +373,7 @@ def _staircase_route() -> Matrix:
         outside = 0.75 if flight % 2 == 0 else -0.75
         low, high = flight * _FLIGHT_M, (flight + 1) * _FLIGHT_M
         up += [[first, y, low], [last, y, high], [last + outside, y, high], [last + outside, -y, high]]
-    up = up[:-2]  # the last landing is turned round on
+    up = up[:-2]  # on the last landing, ``top`` turns around
     top = [[-0.8, 0.7, _TOP_M], [-0.9, -0.5, _TOP_M], [-0.4, -0.5, _TOP_M], [-0.3, 0.2, _TOP_M]]
     ground = [[-0.8, -0.7, 0.0], [-0.9, 0.5, 0.0], [-0.4, 0.5, 0.0], [-0.3, -0.2, 0.0]]
     return np.array([*ground[1:], *up, *top, *up[::-1], ground[0]])
@@ -383,7 +383,7 @@ STAIRCASE_ROUTE = _staircase_route()
 
 
 def staircase(rng: np.random.Generator) -> Solids:
-    """The stairwell: flights along x, landings at either end; doors, radiators and pipes drawn from ``rng``."""
+    """The stairwell: flights along x, landings at either end; doors, radiators and pipes sampled from ``rng``."""
     scenery, middle, length = Scenery(), 0.5 * _RUN_M, _RUN_M + 2.0 * _LANDING_M
     scenery.box((middle, 0.0), (length + 1.0, 2.0 * _STAIR_HALF_M + 1.0), (_ROOF_M, _ROOF_M + 0.2))
     for side in (-1.0, 1.0):
@@ -416,7 +416,7 @@ def _flight(scenery: Scenery, flight: int) -> None:
 def _furnish_landing(
     scenery: Scenery, level: float, wall: float, outwards: float, rng: np.random.Generator
 ) -> None:
-    """A door's frame on a floor, a radiator and a window sill half way; sometimes an extinguisher."""
+    """A door frame on a floor, a radiator and a window sill half way up; sometimes an extinguisher."""
     y = rng.uniform(-0.5, 0.5)
     if outwards < 0.0:
         for side in (-0.5, 0.5):

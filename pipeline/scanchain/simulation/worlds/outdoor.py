@@ -21,7 +21,7 @@ BELOW_M = -1.0  # foundations reach this deep, so that nothing floats on a slope
 
 
 def parked_car(scenery: Scenery, x: float, y: float, yaw: float, rng: np.random.Generator) -> None:
-    """A body, a cabin and four wheels; now and then a van."""
+    """A body, a cabin and four wheels; sometimes a van."""
     length, width = rng.uniform(3.8, 4.8), rng.uniform(1.7, 1.85)
     c, s = np.cos(yaw), np.sin(yaw)
     with scenery.movable():
@@ -60,7 +60,7 @@ TOWN_CAR = Vehicle(
     sway_rad=0.006, heave_m=0.015, radius_m=1.0, T_base_lidar=mount(0.8, 1.73),
 )  # fmt: skip
 
-# A figure of eight round two blocks; the street between them is driven northwards on both loops.
+# A figure of eight around two blocks; the street between them is driven northwards on both loops.
 TOWN_ROUTE = np.array([
     [50.0, 4.0], [50.0, 40.0], [0.0, 40.0], [0.0, 0.0], [50.0, 0.0], [50.0, 40.0], [100.0, 40.0], [100.0, 0.0],
     [50.0, 0.0],
@@ -69,13 +69,13 @@ TOWN_ROUTE = np.array([
 ROUNDS_CAR = replace(TOWN_CAR, corner_m=4.0)  # tighter bends, so that it keeps its lane
 _LANE_FREE_M = 1.8  # on either side of the middle of a lane
 
-# In the right lane, 2 m from the middle of the street, but at last in the left one.
+# In the right lane, 2 m from the middle of the street, but finally in the left one.
 ROUNDS_ROUTE = np.array([
     [2.0, -2.0], [102.0, -2.0], [102.0, 42.0], [-2.0, 42.0],  # new
     [-2.0, 0.0], [-2.0, -38.0], [-48.0, -38.0], [-48.0, 38.0],  # new
     [0.0, 38.0], [98.0, 38.0], [98.0, 2.0],  # the first block again, in the other direction
     [2.0, 2.0], [2.0, 40.0], [2.0, 78.0], [48.0, 78.0], [48.0, 40.0],  # partly new
-    [48.0, -2.0], [102.0, -2.0], [102.0, 38.0], [2.0, 38.0],  # as the first time, at last in the other lane
+    [48.0, -2.0], [102.0, -2.0], [102.0, 38.0], [2.0, 38.0],  # as the first time, finally in the other lane
 ])  # fmt: skip
 
 
@@ -86,9 +86,9 @@ def town(
     streets_x_m: Sequence[float] = _STREETS_X_M,
     streets_y_m: Sequence[float] = _STREETS_Y_M,
 ) -> Solids:
-    """The town; streets and blocks stand where they stand, everything else is drawn from ``rng``.
+    """The town; streets and blocks are fixed, everything else is sampled from ``rng``.
 
-    parked : share of the places at the kerb that have a car on them
+    parked : share of the parking spaces at the curb that are occupied
     streets_x_m, streets_y_m : middles of the streets that run north, and east
     """
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)  # of waves of 0.5 m: slopes of 3 % at most
@@ -129,7 +129,7 @@ def _house(
 ) -> None:
     """A house whose front lies at y = ``front``; ``facing`` +1 if its body lies north of it.
 
-    The body has two parts of different depth, pilasters, perhaps a bay or a porch, and stands a little askew.
+    The body has two parts of different depth, pilasters, perhaps a bay or a porch, and is slightly rotated.
     """
     yaw = rng.normal(0.0, 0.015)
     height = rng.uniform(4.5, 9.0)
@@ -182,7 +182,7 @@ def _street(
 
 
 def rounds(rng: np.random.Generator) -> Solids:
-    """The town, its kerbs empty and its hedges cut where they reach into the lanes."""
+    """The town with empty curbs, without the boxes, such as hedges, that reach into the lanes."""
     solids = town(rng, parked=0.0)
     lanes = np.vstack([np.linspace(a, b, 100) for a, b in pairwise([*ROUNDS_ROUTE, ROUNDS_ROUTE[0]])])
     is_kept = solids.rows[:, 0] != BOX
@@ -195,7 +195,7 @@ def rounds(rng: np.random.Generator) -> Solids:
 # the highway
 
 _STRAIGHT_M, _BEND_M = 1000.0, 300.0
-_MEDIAN_M, _EDGE_M, _FAR_EDGE_M = 6.5, -4.5, 17.5  # rails, to the left of the lane that is driven in
+_MEDIAN_M, _EDGE_M, _FAR_EDGE_M = 6.5, -4.5, 17.5  # rails, to the left of the lane driven in
 _PANEL_M = 4.0  # of a rail, between two posts
 
 HIGHWAY_CAR = Vehicle(
@@ -212,7 +212,7 @@ HIGHWAY_ROUTE = np.vstack([np.zeros((1, 2)), _BEGIN + _ARC, _END - _ARC])
 
 
 def highway(rng: np.random.Generator) -> Solids:
-    """The highway; the rail in the middle is whole, everything else is drawn from ``rng``."""
+    """The highway; the median rail has no gaps, everything else is sampled from ``rng``."""
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
     scenery = Scenery(np.array([0.0, 0.8, 2.0 * np.pi / 420.0, phase_x, 0.8, 2.0 * np.pi / 330.0, phase_y]))
     road = Lap(HIGHWAY_ROUTE)
@@ -285,7 +285,7 @@ FIELD_ROUTE = np.array([[0.0, 0.0], [_FIELD_LONG_M, 0.0], [_FIELD_LONG_M, _FIELD
 
 
 def field(rng: np.random.Generator) -> Solids:
-    """Groups of three poles beside the route, about 230 m apart, and the ground."""
+    """Groups of three poles along the route, about 230 m apart, and the ground."""
     scenery = Scenery()
     for x, y in _POLES:
         for along, side in ((-7.0, 1.0), (0.0, -1.0), (7.0, 1.0)):
@@ -296,8 +296,8 @@ def field(rng: np.random.Generator) -> Solids:
 
 # the forest
 
-_SPACING_M, _BEYOND_M = 4.6, 45.0  # between trunks; how far the forest goes on beyond the route
-_PATH_FREE_M = 1.6  # kept free beside the route
+_SPACING_M, _BEYOND_M = 4.6, 45.0  # between trunks; how far the forest extends beyond the route
+_PATH_FREE_M = 1.6  # kept free on either side of the route
 _WAVES = 4
 
 MULE = Vehicle(
@@ -330,7 +330,7 @@ def forest(rng: np.random.Generator) -> Solids:
 
 
 def _hills(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Hills of 0.8 m and on them waves 4 to 12 m long, at most 9 cm high each."""
+    """Hills of 0.8 m with superimposed waves 4 to 12 m long, at most 9 cm high each."""
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
     hills = [0.0, 0.8, 2.0 * np.pi / 60.0, phase_x, 0.6, 2.0 * np.pi / 45.0, phase_y]
     length_m = np.geomspace(4.0, 12.0, _WAVES)
@@ -342,7 +342,7 @@ def _hills(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _old_tree(scenery: Scenery, place: NDArray[np.float64], rng: np.random.Generator) -> None:
-    """A trunk on its root collar and a crown of two blobs, high up."""
+    """A trunk on its root collar and a crown of two ellipsoids, high up."""
     x, y = place.tolist()
     radius, height = rng.uniform(0.09, 0.32), rng.uniform(6.0, 12.0)
     scenery.cylinder((x, y), radius, (BELOW_M, height))
@@ -354,7 +354,7 @@ def _old_tree(scenery: Scenery, place: NDArray[np.float64], rng: np.random.Gener
 
 
 def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng: np.random.Generator) -> None:
-    """A shrub, a boulder or a fallen log, no farther out than the free ``room``."""
+    """A shrub, a boulder or a fallen log, within the free ``room``."""
     x, y = place.tolist()
     kind, size = rng.random(), min(rng.uniform(0.3, 0.9), room)
     if kind < 0.5:
@@ -375,7 +375,7 @@ YARD_ROBOT = Vehicle(
     radius_m=0.4, T_base_lidar=mount(0.15, 0.9),
 )  # fmt: skip
 
-# A triangle, a square in the other direction, there and back, once round on the spot and once back; it closes.
+# A triangle, a square in the other direction, out and back, full turns on the spot in both directions; it closes.
 YARD_STEPS = (
     *[Pivot(120.0, 3.0)] * 3,
     *[Pivot(-90.0, 2.0)] * 4,
@@ -385,7 +385,7 @@ YARD_STEPS = (
 
 
 def yard(rng: np.random.Generator) -> Solids:
-    """The yard; walls stand where they stand, everything along them is drawn from ``rng``."""
+    """The yard; the walls are in fixed places, everything else is sampled from ``rng``."""
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
     scenery = Scenery(np.array([0.0, 0.1, 2.0 * np.pi / 30.0, phase_x, 0.1, 2.0 * np.pi / 24.0, phase_y]))
     for side in (-1.0, 1.0):

@@ -1,5 +1,5 @@
-// Draws the points and lines of every canvas.scene in perspective, in software: turned, moved and zoomed by mouse,
-// fingers, keys and buttons. Positions come as unsigned 16-bit fractions of the box that holds them all.
+// Software renderer for the points and lines of every canvas.scene, in perspective; rotated, moved and zoomed by
+// mouse, touch, keys and buttons. Positions come as unsigned 16-bit fractions of their bounding box.
 "use strict";
 for (const canvas of document.querySelectorAll("canvas.scene")) show(canvas);
 
@@ -38,7 +38,7 @@ function show(canvas) {
     depths = new Float32Array(width * height);
   }
 
-  function camera() {  // right, up and into the picture of a point (x, y, z), and the size of a meter at distance 1
+  function camera() {  // focal length in pixels, cosines and sines of the angles; sets view.away if it is 0
     const focal = 1.2 * Math.min(canvas.width, canvas.height);
     if (!view.away) {
       const tall = bulk[1] * Math.sin(view.tilt) + bulk[2] * Math.cos(view.tilt);
@@ -72,7 +72,7 @@ function show(canvas) {
     canvas.dataset.drawn = count;
   }
 
-  function ruler(scale, meter) {  // a round length below left; meter: of a pixel
+  function ruler(scale, meter) {  // scale bar of a round length at the lower left; meter: meters per pixel
     const most = 0.2 * canvas.width * meter, decade = 10 ** Math.floor(Math.log10(most));
     const length = decade * (most >= 5 * decade ? 5 : most >= 2 * decade ? 2 : 1), x = 12 * scale, y = canvas.height - x;
     context.setLineDash([]); context.lineWidth = 2 * scale; context.strokeStyle = context.fillStyle = "#e7eaee";
@@ -161,7 +161,7 @@ function show(canvas) {
   reset();
 }
 
-function colors(points, [bottom, top], flat) {  // by height from dark to bright, pale beside the lines
+function colors(points, [bottom, top], flat) {  // by height from dark to bright, paler than the lines
   const anchors = [[62, 66, 100], [72, 96, 118], [104, 132, 126], [168, 164, 122], [240, 214, 140]];
   return Uint32Array.from({length: points.length / 3}, (_, i) => {
     const t = 4 * Math.min(0.9999, Math.max(0, (points[3 * i + 2] - bottom) / Math.max(top - bottom, 1e-6)));
