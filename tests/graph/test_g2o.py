@@ -294,7 +294,7 @@ PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1
 EDGE_SE3:QUAT 0 1 1.5 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1
 """
 PRIORS = (
-    "EDGE_SE3_PRIOR 1 0 5 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1",
+    "EDGE_SE3_XYZPRIOR 1 0 5 0 0 1 0 0 1 0 1",
     "EDGE_POINTXYZ_PRIOR 1 5 0 0 1 0 0 1 0 1",
     "GPS 1 5 0 0",
 )
@@ -319,10 +319,10 @@ def test_where_every_constraint_is_understood_nothing_is_said(read, recwarn):
     assert "without" not in repr(graph) and not recwarn.list
 
 
-def test_optimize_says_that_priors_do_not_count_and_keeps_them(tmp_path, capsys):
+def test_optimize_says_that_lines_it_does_not_know_do_not_count_and_keeps_them(tmp_path, capsys):
     (tmp_path / "a.g2o").write_text(LINE + PRIORS[0] + "\n")
     assert main(["optimize", str(tmp_path / "a.g2o"), "--out", str(tmp_path / "b.g2o")]) == 0
     text = capsys.readouterr().out
-    assert "1 line EDGE_SE3_PRIOR not understood: in neither chi2 nor certificate" in text
-    assert "globally optimal of the problem without 1 line EDGE_SE3_PRIOR" in text
+    assert "1 line EDGE_SE3_XYZPRIOR not understood: in neither chi2 nor certificate" in text
+    assert "globally optimal of the problem without 1 line EDGE_SE3_XYZPRIOR" in text
     assert PRIORS[0] in (tmp_path / "b.g2o").read_text().splitlines()

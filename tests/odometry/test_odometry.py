@@ -333,7 +333,7 @@ def test_a_scan_that_is_logged_twice_changes_no_pose(drive, late_ns):
     for step, copy, expected in zip(steps[::2], steps[1::2], drive.tracked(scans), strict=True):
         assert np.array_equal(step.T_odom_lidar, expected.T_odom_lidar)
         assert np.array_equal(copy.T_odom_lidar, expected.T_odom_lidar)
-        assert copy.is_repeated and copy.scan.is_copy and "once more" in copy.reason
+        assert copy.is_repeated and copy.scan.is_copy and "copy of the previous scan" in copy.reason
 
 
 def test_a_driver_that_is_given_the_same_cloud_says_so(town):

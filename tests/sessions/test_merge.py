@@ -164,7 +164,7 @@ def test_maps_that_cannot_be_merged_are_refused_before_the_search(runs, merged, 
     last_ns = open_saved_map(noon).sessions[0].last_stamp_ns
     index.write_text(index.read_text().replace(str(last_ns), str(last_ns + 1)))
     for runs_, options, message in (
-        ((noon,), {}, "two run directories or more"),
+        ((noon,), {}, "at least two run directories"),
         ((noon, noon), {}, "holds a session"),
         ((merged.path, noon), {}, "holds a session"),
         ((noon, noon_again), {"update": True}, "begin at the same time"),

@@ -1,1 +1,1 @@
-"""The commands, one file each; heavy imports wait until a command runs, so that --help is quick."""
+"""The commands, one file each; heavy imports are deferred until a command runs, so that --help is fast."""

@@ -127,7 +127,7 @@ def _text(evaluated: dict[str, Results], *, is_verbose: bool) -> str:
 
 
 def _figures(results: Results) -> Iterator[str]:
-    """Statistics of one estimate, a row each, in meters and degrees; then the figures that are none."""
+    """Statistics of one estimate, one per row, in meters and degrees, followed by the other figures."""
     from scanchain.evaluation.errors import Metric
 
     if results.pairing:
@@ -148,7 +148,7 @@ def _figures(results: Results) -> Iterator[str]:
 
 
 def _other_figures(results: Results) -> Iterator[str]:
-    """Those that are no statistics of errors of poses or motions."""
+    """Figures other than statistics of pose or motion errors."""
     from scanchain.evaluation.errors import KittiError, RelationError
 
     if "ate" in results.found and (share := results.ate.share_of_path) is not None:
@@ -161,7 +161,7 @@ def _other_figures(results: Results) -> Iterator[str]:
 
 
 def _table(evaluated: dict[str, Results]) -> list[str]:
-    """A row an estimate."""
+    """Table with one row per estimate."""
     computed = dict.fromkeys(key for each in evaluated.values() for key in (*each.found, *each.missing))
     keys = sorted(computed, key=lambda key: key in _FIGURES)
     units, figures = zip(*(_FIGURES.get(key, _RMSE) for key in keys), strict=True)
@@ -179,14 +179,14 @@ def _table(evaluated: dict[str, Results]) -> list[str]:
 _STATISTICS = tuple((name, {"min": "minimum", "max": "maximum"}.get(name, name)) for name in
     ("rmse", "mean", "median", "std", "min", "max"))  # fmt: skip
 _RMSE = ("rmse m", lambda error: error.translation_m.rmse)
-_FIGURES = {  # the unit and the one figure of a metric for a table
+_FIGURES = {  # unit and value that the table shows of a metric; the RMSE of all others
     "kitti": ("%", lambda error: 100.0 * error.translation_share),
     "relations": ("mean m", lambda error: error.translation_m.mean),
 }
 
 
 def _tree(results: Results) -> dict[str, object]:
-    """The figures without the arrays behind them."""
+    """The figures for JSON, without the arrays they are computed from."""
     import numpy as np
 
     tree: dict[str, object] = {}

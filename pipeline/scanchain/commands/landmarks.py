@@ -1,4 +1,4 @@
-"""``scanchain landmarks``: landmark problems solved, on request by several linear solvers side by side."""
+"""``scanchain landmarks``: solves landmark SLAM problems, and compares linear solvers on them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 _OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinear files")
-_ALONE = {  # options that only some problems take
+_ALONE = {  # options that apply to one kind of problem only
     "robot": ("--robot", *_OF_LOGS),
     "noise": ("--odometry-noise", *_OF_LOGS),
     "guess": ("--guess", *_OF_NONLINEAR),
@@ -141,7 +141,7 @@ def landmarks(
 
 
 def _check_options(kinds: Collection[str]) -> None:
-    """Refuse options that none of the problems, of these kinds, takes."""
+    """Refuse options that apply to none of these kinds of problems."""
     ctx = click.get_current_context()
     for name, (flag, kind, what) in _ALONE.items():
         if kind not in kinds and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:

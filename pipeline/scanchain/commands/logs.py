@@ -1,4 +1,4 @@
-"""``scanchain info``, ``doctor``, ``convert`` and ``simulate``: logs read, checked, converted and made."""
+"""``scanchain info``, ``doctor``, ``convert`` and ``simulate``: inspect, check, convert and simulate logs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from scanchain.config import Config
     from scanchain.logs.doctor import Diagnosis
 
-# of convert
+# keys that convert accepts
 _KEYS = tuple(f"log.{key}" for key in ("format", "rate_hz", "bin_columns", "topic", "start_s", "end_s", "every"))
 
 

@@ -1,4 +1,4 @@
-"""``scanchain batch`` and ``compare``: many logs, and many methods on one."""
+"""``scanchain batch`` and ``compare``: runs of many logs, and a comparison of many methods on one log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scanchain map``, ``localize``, ``merge`` and ``changes``: maps of a place, and logs in them."""
+"""``scanchain map``, ``localize``, ``merge`` and ``changes``: maps, their changes, and logs localized in them."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json:
     with Terminal("scans") as terminal:
         localized = localize_log(job, prior, terminal, present_localization, initial=first)
     fails = localized.metrics.verdict.fails(strict=strict)
-    if fails and as_json:  # else the summary holds it
+    if fails and as_json:  # otherwise the summary shows the verdict
         click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
     options.print_summary(out, localized.summary, as_json=as_json)
     return int(fails)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from scanchain.graph.optimization import GraphChange, Optimization
 
 _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
-_POOR_FIT = 10.0  # χ² per degree of freedom, above which no noise model that is a little off explains it
+_POOR_FIT = 10.0  # χ² per degree of freedom above which a slightly wrong noise model is no explanation
 _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 
 
@@ -132,7 +132,7 @@ def _write(
     png: Path | None,
     recording: Path | None,
 ) -> list[str]:
-    """Write the files asked for, with the covariances of the chosen poses (M,); their paths."""
+    """Paths of the requested files, written here, with the marginal covariances of the chosen poses (M,)."""
     from scanchain.graph.covariance import write_covariances
     from scanchain.graph.g2o import rejected_path, write_g2o
 
@@ -146,7 +146,7 @@ def _write(
             write_g2o(rejected, graph, ids=ids, edges="rejected", force=True)
             written.append(rejected)
         else:
-            rejected.unlink(missing_ok=True)  # of an earlier report, whose place --force gave away
+            rejected.unlink(missing_ok=True)  # of an earlier call; --force allows replacing it
         if chosen is not None:
             table = out.with_suffix(".marginals.csv")
             write_covariances(table, ids[chosen], graph.covariances()[chosen])
@@ -165,7 +165,7 @@ def _write(
 
 
 def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
-    """The graph, with a warning where matrices were projected."""
+    """The graph in the file; warns on stderr if information matrices were projected."""
     from scanchain.graph.g2o import read_g2o
 
     with warnings.catch_warnings():
@@ -189,7 +189,7 @@ class _Report:
     certificate: Certificate
 
     def lines(self) -> list[tuple[str, str]]:
-        """Facts by name."""
+        """Lines of the report, as pairs of name and text."""
         from scanchain.graph.edge_checks import free_text, weak_text
 
         file, graph, done = self.file, self.file.graph, self.optimization
@@ -262,7 +262,7 @@ class _Report:
         return f"{first}; after, {fit(after)}" if has_loops(before) else fit(after)
 
     def tree(self) -> dict[str, object]:
-        """The same, and every rejected edge, by vertex ids."""
+        """The report for JSON, with the vertex ids of every rejected edge."""
         graph, done = self.file.graph, self.optimization
         return {
             "warnings": self.warnings,

@@ -1,4 +1,4 @@
-"""Options that commands share, as decorators: configuration keys as flags, --out, --gt, limits; and results."""
+"""Options shared by commands, as decorators (configuration keys, --out, --gt, limits), and output of results."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from scanchain.files import source_of
 from scanchain.settings import Override
 from scanchain.threads import MOST, use_threads
 
-_GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
+_GARBAGE_EVERY = 500_000  # new objects between two garbage collections; frequent ones cost 5 % of the time
 _ALIASES = "scanchain.commands.aliases"
 _MIB_PER_GIB = 1024.0
 PATH = click.Path(path_type=Path)
 
 
 def collect_garbage_seldom() -> None:
-    """Search for garbage less often, for commands that process a log."""
+    """Run the garbage collector less often, for commands that process a log."""
     gc.set_threshold(_GARBAGE_EVERY)
 
 
 class NumberRange(click.FloatRange):
-    """A range that NaN, which compares with nothing, is outside of."""
+    """A range of numbers that also rejects NaN, which passes the comparisons of click."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number."""
+        """The number; fails if it is NaN or out of range."""
         number = super().convert(value, param, ctx)
         if isnan(number):
             self.fail(f"{value} is no number.", param, ctx)
@@ -44,7 +44,7 @@ ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 class OverrideCommand(click.Command):
-    """Command that takes any configuration key as ``--section.key value``; ``overrides`` are all that are set.
+    """Command that takes any configuration key as ``--section.key value``; ``overrides`` are all given ones.
 
     Options with a dot in their name are taken out of the arguments before click sees the rest.
     """
@@ -53,9 +53,9 @@ class OverrideCommand(click.Command):
         super().__init__(*words, options_metavar=options_metavar, **more)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the overrides and the ordinary arguments; of a key that is set twice the last counts.
+        """Parse the overrides and the ordinary arguments; for a key that is set twice, the last value counts.
 
-        Short forms yield to keys that are written out.
+        Keys that are written out override their short forms.
         """
         rest: list[str] = []
         overrides: list[Override] = []
@@ -82,7 +82,7 @@ def _set(ctx: click.Context, override: Override) -> None:
 
 
 def key(flag: str, name: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
-    """An option that sets a configuration key; ``value`` is that of a flag."""
+    """An option that sets a configuration key; with ``value``, a flag without argument that sets this value."""
 
     def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
         if given not in (None, False):
@@ -103,7 +103,7 @@ def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
 def part(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
     """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log.
 
-    log, topic : in words, what is cut and which lidar is taken without ``--topic``
+    log, topic : in words, the log that is cut, and the lidar topic used without ``--topic``
     """
     of = "" if log == "the log" else f" of {log}"
     begin = f"Skip {log} up to this time, counted from its first message."
@@ -157,7 +157,7 @@ def ground_truth(
     metavar: str = "FILE|TOPIC|none",
     help: str = "Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
 ) -> Callable[[Any], Any]:
-    """The option ``--gt``: ``ground_truth`` is a file or None, a topic or "none" is an override."""
+    """``--gt``: a file is passed as ``ground_truth``, else None; a topic or "none" becomes an override."""
 
     def keep(ctx: click.Context, _: click.Parameter, text: str | None) -> Path | None:
         if text is None:
@@ -174,7 +174,7 @@ of_log = _together(config, part(), matcher, ground_truth(), max_gap, threads)
 
 
 def force(replaced: str) -> Callable[[Any], Any]:
-    """``--force``, with what it replaces in words."""
+    """``--force``; ``replaced`` says in the help what it replaces."""
     return click.option("--force", is_flag=True, help=f"Replace {replaced}.")
 
 
@@ -190,7 +190,7 @@ def result(replaced: str, what: str = "Directory to create.", *, required: bool 
 
 
 def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
-    """Print the summary of a result and where it lies, or its metrics as they are in the file."""
+    """Print the summary and the directory of a result, or its metrics.json unchanged."""
     from scanchain.runs.metrics import shortened
 
     click.echo((out / "metrics.json").read_text(encoding="utf-8") if as_json else shortened(summary), nl=False)
@@ -199,7 +199,7 @@ def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
 
 
 def json_text(tree: object) -> str:
-    """Records, dictionaries and numbers of NumPy as indented JSON; what is not finite becomes null."""
+    """Records, dictionaries and NumPy numbers as indented JSON; non-finite numbers become null."""
     return msgspec.json.format(msgspec.json.encode(tree, enc_hook=lambda number: number.item()), indent=2).decode()
 
 
@@ -228,7 +228,7 @@ def limits(what: str, *, time_default: str, memory_default: str) -> Callable[[An
 
 
 def numbers(text: str, counts: Collection[int], wrong: str) -> list[float]:
-    """Numbers with commas between them, as many as one of these counts. Raises InputError with this message."""
+    """Comma-separated finite numbers, as many as one of ``counts``. Raises InputError(wrong) otherwise."""
     try:
         values = [float(word) for word in text.split(",")]
     except ValueError:
@@ -239,7 +239,7 @@ def numbers(text: str, counts: Collection[int], wrong: str) -> list[float]:
 
 
 def check_output(path: Path, *, force: bool, endings: Sequence[str] = ()) -> None:
-    """Refuse what could not be written after the work, would replace something, or has none of these suffixes."""
+    """Refuse a path that cannot be written, that exists unless ``force``, or that has none of these suffixes."""
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; make it first")
     if path.is_dir():

@@ -32,7 +32,7 @@ def config() -> None:
 
 
 def _effective(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that takes ``settings``: of --lidar, --config and all keys."""
+    """A command that receives the ``settings`` resulting from --lidar, --config and all keys."""
 
     @wraps(command)
     def run(config_file: Path | None, lidar: str | None, overrides: tuple[Override, ...], **given: Any) -> None:

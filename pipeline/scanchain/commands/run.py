@@ -84,9 +84,9 @@ def run(out: Path | None, rerun: str, strict: bool, as_json: bool, **given: Any)
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
     fails = finished.metrics.verdict.fails(strict=strict)
-    if fails and as_json:  # else the summary holds it
+    if fails and as_json:  # otherwise the summary shows the verdict
         click.echo(f"error: {finished.path}: {finished.metrics.sentence}", err=True)
-    is_seen = sys.stdout.isatty() and not as_json  # a terminal shows both, and the summary holds them
+    is_seen = sys.stdout.isatty() and not as_json  # then the summary already shows these warnings
     for warning in [each for each in finished.warnings if not (is_seen and each in finished.summary)]:
         click.echo(f"warning: {warning}", err=True)
     options.print_summary(finished.path if finished.stopped else out, finished.summary, as_json=as_json)
@@ -100,7 +100,7 @@ def run(out: Path | None, rerun: str, strict: bool, as_json: bool, **given: Any)
 
 
 def _unnamed(log: Source, *, is_taken_over: bool) -> Path:
-    """Directory of a run of this log where none is given: the first that is free, or a given one is taken over."""
+    """Default run directory of a log: runs/NAME if free or taken over, else the first free of runs/NAME_2, ..."""
     name = str(log).rstrip("/").rpartition("/")[2].partition(".")[0] or "log"
     paths = (Path("runs", each) for each in chain([name], (f"{name}_{number}" for number in count(2))))
     return next(path for path in paths if is_taken_over or not path.exists())
@@ -202,5 +202,5 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
         )
     from scanchain_viz.recording.viewer import show
 
-    with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
+    with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C, including the server
         show(path, click.echo, in_browser=web)

@@ -1,4 +1,4 @@
-"""A line of progress on a terminal, silence elsewhere, and Ctrl-C that ends a run in good order."""
+"""Progress bar on a terminal, no output of it elsewhere, and a graceful stop of a run by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from scanchain.data import Scan
 
 _REDRAW_S = 0.2
-_CLEAR = "\r\033[K"  # to the begin of the line, which is emptied
+_CLEAR = "\r\033[K"  # moves to the start of the line and clears it
 _WIDTH = 30  # characters of a full bar
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
@@ -28,16 +28,16 @@ _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if
 class Terminal(Progress):
     """Progress of a job; a context manager.
 
-    On the first Ctrl-C (or SIGTERM, or a closed terminal) while scans are tracked no more of them come, and the
-    run finishes with what it has; at any other time, and on the second, it interrupts as usual.
+    The first Ctrl-C (or SIGTERM, or a closed terminal) during tracking ends the input of scans, and the run
+    finishes with those so far. A second one, or one at any other time, raises KeyboardInterrupt.
     """
 
     def __init__(self, unit: str) -> None:
         self.unit = unit
         self.stopped = self.is_tracking = False
         self.is_seen = sys.stderr.isatty()
-        self.started_s, self.first, self.drawn_s = 0.0, 0, 0.0  # first: how many were done at the start
-        self.bar = ""  # as it stands in the last line
+        self.started_s, self.first, self.drawn_s = 0.0, 0, 0.0  # first: number done at the start
+        self.bar = ""  # as last displayed
         self.handlers = {}
 
     def __enter__(self) -> Self:
@@ -67,20 +67,20 @@ class Terminal(Progress):
         self.is_tracking = True
         for scan in scans:
             yield scan
-            self.count(scan.index + 1, count)  # from where a run is resumed on
+            self.count(scan.index + 1, count)  # includes the scans before a resumed run
             if self.stopped:
                 break
         self.is_tracking = False
         self._close()
 
     def compiling(self, done: int, total: int) -> None:
-        """Draw how many of all kernels are compiled."""
+        """Show the number of compiled kernels."""
         if self.is_seen:
             text = f"compiling kernels, once after an installation: {done} of {total}"
             click.echo(f"{_CLEAR}{text}", nl=done == total, err=True)
 
     def count(self, done: int, total: int) -> None:
-        """Draw how many are done, but not more often than an eye can follow."""
+        """Show how many are done, at most every ``_REDRAW_S``."""
         now_s = monotonic()
         if not self.started_s:
             self.started_s, self.first = now_s, done

@@ -308,6 +308,7 @@ def write_g2o(
     between, of_one = pairs[~is_prior], of_edges[is_prior]
     lines += write_lines(d, names[between], of_edges[~is_prior], graph.is_point[between[:, 1]], is_toro=is_toro)
     lines += _prior_lines(d, names[pairs[is_prior, 1]], of_one, information[is_prior])
+    other_lines = [line for line in other_lines if line not in lines]  # the offset of priors is written once
     with checks.writing(path, force=force):
         write_whole(path, "\n".join([*lines, *other_lines, ""]).encode())
 

@@ -15,11 +15,11 @@ from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.publishers import Publisher
 
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
-_FEWEST_COPIED = 10  # least points of a scan that may be a copy
-_COPIES_SHARE = 0.01  # of the scans, up to which copies are no warning
-_MOST_RATE = 50.0  # of one clock over the other, above which their units differ: by 1000 or more, but for gaps
-_AGAIN = 0.1  # share of a jump of the stamps, up to which they begin again as at first
-_SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
+_FEWEST_COPIED = 10  # least number of points for a scan to count as a copy
+_COPIES_SHARE = 0.01  # share of copies among the scans above which they are a warning
+_MOST_RATE = 50.0  # ratio of two clocks' rates above which their units differ (by 1000 or more, apart from gaps)
+_AGAIN = 0.1  # distance from the first stamp, as a share of the jump, below which the stamps have restarted
+_SAMPLE = 64  # points tested first: every 64th for the range (usually one is in it), the first 64 for a copy
 
 
 @dataclass(slots=True)
@@ -34,12 +34,12 @@ class _Tally:
 
     @property
     def is_used(self) -> bool:
-        """True if its messages are used: not those of a second one without a return so far."""
+        """True if its messages are used; those of a further publisher only once one had returns."""
         return self.publisher.is_used and (not self.publisher.note or self.with_returns > 0)
 
     @property
     def text(self) -> str:
-        """The publisher in words."""
+        """Frame, stamps and share of messages with returns, as text."""
         percent = 100.0 * self.with_returns / self.messages
         clock = f"stamps {1e-9 * self.begin_ns:.1f} to {1e-9 * self.end_ns:.1f} s"
         return f"frame {self.publisher.frame or 'without a name'} ({clock}, {percent:.3g} % with returns)"
@@ -50,13 +50,13 @@ def _signed(time_s: float) -> str:
 
 
 def most_bad_scans(scans: int, config: LogConfig) -> float:
-    """Largest number of scans that may be left out; unlimited at 100 %, as a damaged log may hold more scans."""
+    """Largest number of scans that may be left out; unlimited at 100 %, as a damaged log may contain more."""
     share = 0.01 * config.max_bad_scans_percent
     return math.ceil(share * scans) if share < 1.0 else math.inf
 
 
 def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
-    """Defect that makes a scan unusable, to follow its name; empty where it is usable."""
+    """Defect that makes a scan unusable, as text to follow its name; empty if it is usable."""
     returns = message.value
     if not isinstance(returns, Returns):
         return f"is malformed: {returns}"
@@ -95,11 +95,11 @@ class ScanCounts:
         self.publishers: dict[str, _Tally] = {}
         self.jumps_s, self.first_jump = list[float](), ""
         self.first_complaint = ""
-        self.steps_ns = [(0, 0)]  # of header stamps and log times from scan to scan, where neither jumps
+        self.steps_ns = [(0, 0)]  # steps of header stamp and log time from scan to scan, without jumps
         self._last: Scan | None = None
 
     def skip(self, complaint: str, expected: int, config: LogConfig) -> None:
-        """Count a scan that is left out. Raises InputError for more of the expected number than are allowed."""
+        """Count a scan that is left out. Raises InputError if too many of the ``expected`` scans are left out."""
         self.scans += 1
         self.bad += 1
         self.first_complaint = self.first_complaint or complaint
@@ -119,7 +119,7 @@ class ScanCounts:
         return tally.is_used
 
     def repeats(self, points: RawPoints) -> bool:
-        """True if the points of a scan are those of the one before, to the last bit."""
+        """True if the points of a scan are bitwise identical to those of the previous one."""
         if self._last is None or len(points) < _FEWEST_COPIED:
             return False
         last = self._last.points
@@ -139,7 +139,7 @@ class ScanCounts:
                 self.backwards += 1
                 self.farthest_back_ns = max(self.farthest_back_ns, back_ns)
             self.repeated += back_ns == 0
-            if self._last.stamp_ns and not scan.clock_jump_s:  # not from a stamp before the first /clock on
+            if self._last.stamp_ns and not scan.clock_jump_s:  # no step from a zero stamp, before /clock
                 self.steps_ns.append((-back_ns, scan.log_time_ns - self._last.log_time_ns))
         self._last = scan
         self.begin_ns = self.begin_ns or scan.stamp_ns
@@ -158,7 +158,7 @@ class ScanCounts:
         return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
 
     def losses(self) -> list[str]:
-        """Warnings of scans left out or copied, and of stamps that most scans do not have."""
+        """Warnings about scans left out or copied, and about header stamps if most repeat the previous one."""
         tallies = self.publishers.values()
         used = "".join(f"; used is {each.text}" for each in tallies if not each.publisher.note)
         total = counted(sum(each.messages for each in tallies), "message")
@@ -183,7 +183,7 @@ class ScanCounts:
         return lines
 
     def jumps(self) -> list[str]:
-        """Lines on jumps of the header stamps, and on a rate that is not that of the log times; none as a rule."""
+        """Warnings about jumps of the header stamps, and about a rate different from that of the log times."""
         lines = []
         if self.jumps_s:
             lines.append(
@@ -195,20 +195,20 @@ class ScanCounts:
         (all_s, all_logged_s), (usual_s, usual_logged_s) = steps_s.sum(axis=0), np.median(steps_s, axis=0)
         is_apart = 0.0 < _MOST_RATE * min(all_s, all_logged_s) < max(all_s, all_logged_s)
         advance = f"{all_s:.3g} s, log times by {all_logged_s:.3g} s" if is_apart else ""
-        if 0.0 < _MOST_RATE * usual_s < usual_logged_s:  # the other way round they are logged in bursts
+        if 0.0 < _MOST_RATE * usual_s < usual_logged_s:  # the inverse only means logging in bursts
             advance = f"{usual_s:.3g} s from scan to scan, log times by {usual_logged_s:.3g} s (medians)"
         if advance:
             lines.append(f"header stamps of {self.topic} advance by {advance}: is one of them in another unit?")
         return lines
 
     def recovered(self, expected: int) -> str:
-        """Number of scans of a damaged log that could be read, of those to expect where there are fewer."""
+        """Number of scans read from a damaged log, with the expected number if fewer were found, as text."""
         read = self.scans - self.bad
         scans = counted(read, "scan") if self.scans >= expected else f"{read:,} of {counted(expected, 'scan')}"
         return f"{scans} of {self.topic} {'was' if read == 1 else 'were'} recovered"
 
     def notes(self) -> list[str]:
-        """Lines on a few copies, stamps out of order and missing wheel odometry."""
+        """Notes on a small number of copies, on stamps out of order and on missing wheel odometry."""
         lines = []
         if 0 < self.copies <= max(MOST_COPIES, _COPIES_SHARE * self.scans):
             lines.append(

@@ -1,4 +1,4 @@
-"""A log of any format that is known as one MCAP file."""
+"""Conversion of a log of any supported format to one MCAP file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """Result of a conversion: messages by topic, those left out by choice, those that could not be read."""
+    """Result of a conversion: message counts by topic, notes on what was left out by choice, and damage."""
 
     path: Path
     messages: dict[str, int]
@@ -43,11 +43,11 @@ def convert(
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Converted:
-    """Write the messages of the sources, one log, by log time. ROS messages stay as they are, byte by byte.
+    """Write the sources, as one log, to an MCAP file in order of log time; ROS messages are copied unchanged.
 
-    config : what is left out: what lies before ``start_s`` and behind ``end_s``, the lidars beside ``topic``, all
-        but every ``every``-th scan; static transforms are kept, from the start on
-    Raises InputError for what cannot be read or written.
+    config : what is left out: messages before ``start_s`` and after ``end_s``, lidars other than ``topic``, all
+        but every ``every``-th scan; static transforms of the whole log are kept
+    Raises InputError if the sources cannot be read or the file cannot be written.
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
@@ -92,7 +92,7 @@ def convert(
 def _messages(
     indexes: Sequence[FileIndex], topics: Iterable[str], config: LogConfig, damage: list[str]
 ) -> Iterator[Decoded]:
-    """The messages to write. Static transforms come first, and none before the chosen part begins."""
+    """Messages to write. For a part of a log, static transforms come first, at log times within the part."""
     span = stream.chosen_span(stream.whole_span(indexes), config)
     fixed = set() if span == stream.EVERYTHING else {topic for topic in topics if topic.endswith(_FIXED)}
     for message in stream.decoded_messages(indexes, dict.fromkeys(fixed, bytes), stream.EVERYTHING, damage=[]):
@@ -101,7 +101,7 @@ def _messages(
     scans = Counter[str]()
     for message in stream.decoded_messages(indexes, others, span, damage=damage):
         scans[message.channel.topic] += is_lidar(message.channel)
-        if not isinstance(message.value, bytes):  # of a file that could not be read
+        if not isinstance(message.value, bytes):  # an error: it could not be read
             continue
         if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
             yield message

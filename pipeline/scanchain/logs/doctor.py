@@ -27,13 +27,13 @@ from scanchain.range_noise import RangeNoise
 
 _GAP_PERIODS = 2.5
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
-_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
-_FASTEST_M_S = 100.0  # speed by the wheels above which their unit is another
-_LEAST_STEP_M = 1e-3  # length of a step between two readings above which the wheels turn
+_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # scan duration over period outside which a time unit is implausible
+_FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
+_LEAST_STEP_M = 1e-3  # distance between two wheel readings above which the robot moves
 _MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
-_STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
+_STUCK_SHARE = 0.01  # share of beams at the farthest range above which it is reported
 _FEW_POINTS = 50
-_SAME_M = 1e-4  # largest difference of ranges that are one number: rounding of float32
+_SAME_M = 1e-4  # largest difference of ranges that count as equal: rounding of float32
 
 
 class Severity(StrEnum):
@@ -49,10 +49,10 @@ class Severity(StrEnum):
 class Finding:
     """Result of one check.
 
-    check : what was looked at, one word or two
+    check : what was checked, in one or two words
     found : what was measured, with units
-    effect : what it does to the result, empty where it does nothing
-    remedy : flags of ``scanchain run`` that help, as they are typed and nothing else; empty where none does
+    effect : effect on the result, empty if there is none
+    remedy : flags of ``scanchain run`` that help, exactly as typed; empty if none does
     """
 
     check: str
@@ -64,7 +64,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The findings about a log, the gravest first; ``notes`` are what opening it assumed."""
+    """Findings about a log, the most severe first; ``notes`` : what was assumed when opening it."""
 
     files: tuple[str, ...]
     topic: str
@@ -80,10 +80,10 @@ def examine(
     progress: Callable[[int, int], None],
     distortion: Callable[[Log], tuple[str, str]] = lambda log: ("", ""),
 ) -> Diagnosis:
-    """Diagnosis from every scan of a log. Raises InputError where a run could not open it either.
+    """Diagnosis from every scan of a log. Raises InputError if a run could not open it either.
 
-    config_of : what a run would use for a log of this dimension
-    distortion : that of its scans by the lidar's motion, in words, and the flags that remove it
+    config_of : configuration that a run would use for a log of a given dimension
+    distortion : distortion of a log's scans by the lidar's motion, as text, and the flags that remove it
     """
     log = open_log(sources, replace(log_config, max_bad_scans_percent=100.0))
     notes = tuple(log.notes)
@@ -105,16 +105,16 @@ class Facts(NamedTuple):
     """Statistics of the returns of one scan."""
 
     kept: int  # number of valid returns
-    dropped: int  # and of the others
+    dropped: int  # number of invalid returns
     farthest_m: float
-    at_farthest: int  # number of returns with just that range
+    at_farthest: int  # number of returns at that range
     ranges_m: NDArray[np.float32]  # (101,) percentiles
     time_span_s: float  # of the per-point times, NaN where there are none
-    is_copy: bool  # the points are those of the scan before, to the last bit
+    is_copy: bool  # the points are bitwise identical to those of the previous scan
 
 
 class Survey:
-    """Facts of the readable scans of a log and their times; stamps and wheels' positions (d,) where known."""
+    """Statistics of the readable scans of a log, their times, and stamped wheel odometry positions (d,)."""
 
     def __init__(self, log: Log) -> None:
         self.log = log
@@ -125,7 +125,7 @@ class Survey:
         self.noise = RangeNoise()
 
     def take(self, scan: Scan) -> None:
-        """Take in the next scan."""
+        """Add the next scan."""
         self.log_times_ns.append(scan.log_time_ns)
         self.stamps_ns.append(scan.stamp_ns)
         self.noise = self.noise.measured(scan.points)
@@ -146,12 +146,12 @@ class Survey:
 
     @property
     def messages(self) -> int:
-        """Number of scans, those that are not readable included."""
+        """Number of scans, including unreadable ones."""
         return len(self.scans) + self.log.bad_scans
 
     @property
     def period_s(self) -> float:
-        """Median time between scans of different stamps or, where these do not move, log times; 0 if alone."""
+        """Median time between scans by header stamps or, if these do not advance, by log times; 0 if unknown."""
         for times_ns in (self.stamps_ns, self.log_times_ns):
             steps_s = 1e-9 * np.array([step_ns for step_ns in np.diff(times_ns) if step_ns])
             if len(steps_s) and np.median(steps_s) > 0.0:
@@ -159,12 +159,12 @@ class Survey:
         return 0.0
 
     def into_log_s(self, place: int) -> float:
-        """Seconds from the log's first message to a scan, as ``--start`` and ``--end`` count."""
+        """Seconds from the log's first message to scan number ``place``, as in ``--start`` and ``--end``."""
         return (self.log_times_ns[place] - whole_span(self.log.indexes).begin_ns) * 1e-9
 
 
 def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
-    """Every finding about a log. ``config`` is what a run of it would use; ``most_bad`` scans it may lack."""
+    """All findings about a log, for a run with ``config`` that may leave out up to ``most_bad`` scans."""
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
     yield _stamps(seen)
     yield _wheels(seen)
@@ -197,7 +197,7 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
 
 
 def _stamps(seen: Survey) -> Finding:
-    """Finding on header stamps that run back, jump, or run at another rate than log times."""
+    """Finding on header stamps that go backward, jump, or advance at a different rate than log times."""
     if seen.log.jumps:
         effect = "speeds count by header stamps; gaps, --start and --end by log times: correct what is wrong"
         if "jump" in seen.log.jumps[0]:
@@ -234,7 +234,7 @@ def _wheels(seen: Survey) -> Finding:
 
 
 def _wheel_speed_m_s(seen: Survey) -> float:
-    """Median speed by the wheels while they turn; 0 where they stand still."""
+    """Median speed of the robot while it moves, from wheel odometry; 0 if it never moves."""
     if not seen.wheels:
         return 0.0
     stamps_ns, order = np.unique([stamp_ns for stamp_ns, _ in seen.wheels], return_index=True)
@@ -267,9 +267,9 @@ def _point_times(seen: Survey) -> Finding:
 
 
 def _other_unit(assumed: str, part: float) -> str:
-    """The flag for the unit in which scans last about a period; where none fits times too long, that for none.
+    """Flag for the time unit in which a scan lasts about a period, else to ignore times that are too long.
 
-    part : of the period that scans last in the unit that was taken
+    part : scan duration over period in the assumed unit
     """
     taken = next((unit for unit in UNITS_S if f"taken as {unit} " in assumed), "")
     if not taken:
@@ -312,7 +312,7 @@ def _returns(seen: Survey) -> Finding:
 
 
 def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
-    """The flags that leave out scans at the start and at the end, where these are the poor ones and no others."""
+    """Flags that cut off the poor scans at the start and end of a log; empty if there are others in between."""
     good = np.flatnonzero(~poor)
     if not len(good) or poor[good[0] : good[-1] + 1].any():
         return ""
@@ -322,7 +322,7 @@ def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
 
 
 def _noise(noise: RangeNoise, assumed_m: float) -> Finding:
-    """Finding on the noise of ranges, against what a run assumes at least."""
+    """Finding on the range noise, compared with the least noise that a run assumes."""
     found = f"standard deviation {noise.text}"
     if noise.sigma_m <= assumed_m:
         return Finding("noise", Severity.OK, found)
@@ -331,7 +331,7 @@ def _noise(noise: RangeNoise, assumed_m: float) -> Finding:
 
 
 def _no_return(seen: Survey) -> Finding:
-    """Finding on beams that all have one farthest range, as of scanners that write a number for no return."""
+    """Finding on many beams at the same farthest range, as of scanners that report a number for no return."""
     values = Counter(scan.farthest_m for scan in seen.scans)
     farthest_m = max(values)
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
@@ -340,7 +340,7 @@ def _no_return(seen: Survey) -> Finding:
         return Finding("no return", Severity.OK, "no range is so frequent that it must mean no return")
     found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest there is"
     effect = "if it stands for no return, it is taken for a wall that moves along"
-    below_m = math.floor(1e3 * farthest_m - 0.5) / 1e3  # below the range, to the last bit
+    below_m = math.floor(1e3 * farthest_m - 0.5) / 1e3  # strictly below the range, despite rounding
     return Finding("no return", Severity.WARNING, found, effect, f"--log.max_range_m {below_m:g}")
 
 

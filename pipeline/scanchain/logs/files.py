@@ -1,4 +1,4 @@
-"""The files of a log: their sizes, and those at an address, read by byte ranges through fsspec or copied whole."""
+"""Files of a log: their sizes, and remote files, read by byte ranges through fsspec or downloaded whole."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scanchain.files import Address, Source
 T = TypeVar("T")
 _ATTEMPTS = 4
 _PAUSE_S = 0.5  # pause after the first failure; twice as long after each further one
-_CONNECT_S, _SILENCE_S = 10.0, 30.0  # timeouts after which a server counts as gone
+_CONNECT_S, _SILENCE_S = 10.0, 30.0  # timeouts for connecting, and while waiting for data
 _ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
 
 _BLOCK_BYTES = 8_000_000
@@ -28,8 +28,8 @@ _BLOCK_BYTES = 8_000_000
 class RemoteFile:
     """A file at an address.
 
-    size : bytes, 0 where the server does not state it
-    version : its ETag or when it was last changed, empty where the server does not state it
+    size : bytes, 0 if the server does not report it
+    version : its ETag or time of last modification, empty if the server reports neither
     """
 
     def __init__(self, address: Address) -> None:
@@ -48,7 +48,7 @@ class RemoteFile:
 
     @cached_property
     def has_ranges(self) -> bool:
-        """True if parts of it can be requested: its last byte comes alone."""
+        """True if byte ranges can be requested; tested with the last byte."""
 
         def ask() -> bool:
             try:
@@ -61,7 +61,7 @@ class RemoteFile:
         return self._may_have_ranges and _patient(ask, str(self.address))
 
     def read(self, offset: int, size: int) -> bytes:
-        """So many bytes from the offset on. Raises InputError where they do not come after several requests."""
+        """``size`` bytes from ``offset`` on. Raises InputError if several requests do not return them."""
 
         def ask() -> bytes:
             data: bytes = self._system.cat_file(self._path, start=offset, end=offset + size)
@@ -97,15 +97,15 @@ def _system_of(address: Address) -> tuple[Any, str]:
 
 
 def _patient(ask: Callable[[], T], what: str) -> T:
-    """Result of a request, repeated after errors that may pass."""
+    """Result of a request, retried after errors that may be transient."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             return ask()
-        except Exception as error:  # each file system raises what the libraries below it raise
+        except Exception as error:  # each file system raises errors of its own libraries
             cause = error.__cause__ or error
             status = int(getattr(cause, "status", 0) or 0)  # of HTTP
             text = f"{status} {getattr(cause, 'message', '')}" if status else str(cause)
-            is_absent = isinstance(cause, FileNotFoundError)  # its text would be the address, keys and all
+            is_absent = isinstance(cause, FileNotFoundError)  # its text would be the address with its keys
             reason = "not found" if is_absent else " ".join(text.split()) or type(cause).__name__
             if hopeless := _hopeless(error, status):
                 raise InputError(f"{what}: {hopeless} ({reason})") from error
@@ -116,7 +116,7 @@ def _patient(ask: Callable[[], T], what: str) -> T:
 
 
 def _hopeless(error: Exception, status: int) -> str:
-    """Remedy for an error that repeating does not mend, empty for one that may pass."""
+    """Remedy for an error that a retry cannot fix; empty for one that may be transient."""
     if status in _ABSENT or (isinstance(error, FileNotFoundError) and error.__cause__ is None):
         return "no such file; check the address"
     if status in _REFUSED or isinstance(error, PermissionError) or type(error).__name__ == "NoCredentialsError":
@@ -128,7 +128,7 @@ def _hopeless(error: Exception, status: int) -> str:
 
 
 def fetch_whole(file: RemoteFile) -> Path:
-    """The path of the copy. Raises InputError where it does not come or finds no room."""
+    """Path of a temporary copy of a remote file. Raises InputError if it cannot be downloaded or stored."""
     folder = Path(mkdtemp(prefix="scanchain-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     copy = folder / (file.address.name or "log")
@@ -145,18 +145,18 @@ def fetch_whole(file: RemoteFile) -> Path:
 
 
 def files_of(path: Path) -> list[Path]:
-    """The file itself, or every file in a folder and below, in the order of their names."""
+    """The file itself, or all files in a folder and its subfolders, sorted by path."""
     return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
 
 
 def misspelled(source: Source) -> str:
-    """Reason why a name is no text, which could not be printed; empty where it is text."""
+    """Error text for a name that is not valid UTF-8 and cannot be printed; empty if it is valid."""
     name = os.path.realpath(source) if isinstance(source, Path) else str(source)
     return "" if spelled(name) == name else f"{spelled(name)}: the name is not UTF-8; rename it"
 
 
 def size_of(source: Source) -> int:
-    """Bytes of all of them, or of what lies at an address."""
+    """Size in bytes of a file, of all files in a folder, or of a remote file."""
     if not isinstance(source, Path):
         return RemoteFile(source).size
     return sum(file.stat().st_size for file in files_of(source))

@@ -19,16 +19,16 @@ from scanchain.logs.topics import find_ground_truth, find_odometry, other_sensor
 
 
 def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
-    """Files, topics, those that a run would use, and problems. Raises InputError for what is no log.
+    """Files and topics of a log, the topics that a run would use, and problems. Raises InputError if it is no log.
 
-    ``lidar`` is empty where a run could not choose a topic, for the reason in ``problem``; ``sensors`` are those
-    beside lidar and wheels. Meters, radians, nanoseconds; ``T_base_lidar`` row by row, the first one where the
-    lidar moves (``mount_motion``); ``base_frame`` is empty where the log does not state it.
+    ``lidar`` is empty if a run could not choose a topic; ``problem`` is the reason. ``sensors`` are those other
+    than lidar and wheels. Units are in the names, lengths in meters; ``T_base_lidar`` is a list of rows, of the
+    first pose if the lidar moves (``mount_motion``); ``base_frame`` is empty if the log does not state it.
     """
     indexes = index_files(sources, config)
     whole = whole_span(indexes)
     notes, (wheels, truth) = [line for index in indexes for line in index.notes], ("", "")
-    with suppress(InputError):  # which is the problem of the log as well
+    with suppress(InputError):  # Log raises it too: see ``problem``
         channels = find_odometry(indexes, config, notes), find_ground_truth(indexes, config.ground_truth_topic)
         wheels, truth = (channel.topic if channel and has_poses(channel) else "" for channel in channels)
     try:
@@ -58,7 +58,7 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
 
 
 def _topic(indexes: Sequence[FileIndex], topic: str, duration_s: float) -> dict[str, Any]:
-    """A topic, its messages added up over the files; the rate is 0 where there is one alone."""
+    """Facts of a topic, its messages counted over all files; the rate is 0 for a single message."""
     channel = topics_of(indexes)[topic]
     messages = sum(index.counts.get(number, 0) for index in indexes for number in index.numbers_of(topic))
     span_s = (ends_of(indexes, topic).duration_s if messages > 1 else 0.0) or duration_s

@@ -1,4 +1,4 @@
-"""A log: files or folders of any format that is known, read as a stream of scans."""
+"""A log: files or folders of any supported format, read as a stream of scans."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
-_HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
+_HOLD_NS = 500_000_000  # longest log time that a scan waits for the next wheel reading
 _HOLD_SCANS = 32
 
 
 def open_log(
     sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS, **changes: object
 ) -> Log:
-    """A file, folder or address, or several as one log, topics chosen.
+    """Log of one file, folder or address, or of several, opened and its topics chosen.
 
     changes : keys of ``[log]`` on top of ``config``, such as topic="/lidar_front/points" or end_s=60.0
-    Raises InputError for what is no log, or no key.
+    Raises InputError if it is no log, or for an unknown key.
     """
     named = sources_of(sources)
     checks.instance(
@@ -58,7 +58,7 @@ def open_log(
 
 
 def sources_of(sources: Source | str | Sequence[Source | str]) -> tuple[Source, ...]:
-    """The files or addresses of one log. Raises InputError for what is neither, and for none."""
+    """The files or addresses of one log. Raises InputError for anything else, and for an empty list."""
     named = [sources] if isinstance(sources, Source | str) else sources
     is_named = isinstance(named, Sequence) and all(isinstance(each, Source | str) for each in named)
     if not is_named:
@@ -73,18 +73,18 @@ class Log:
 
     paths : its files; name : these as errors name them
     topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
-    mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it; stated_mounting : the same, None
-        where it is assumed
-    scan_count : scans to expect after start, end and every, by the index
+    mounting : mounting of the lidar on the robot; T_base_lidar : (d+1, d+1) its pose; stated_mounting : the same
+        pose, None if it is assumed
+    scan_count : number of scans to expect by the index, given start, end and every
     duration_s : from the first message to the last
-    odometry_topic : whose poses the scans carry, empty where there is none; wheels : the same in print, of /tf
-        with frames and rate
-    scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
+    odometry_topic : topic of the wheel odometry, empty if there is none; wheels : the same as text, for /tf with
+        frames and rate
+    scans_with_wheels : number of scans read so far that have a wheel reading near their stamp
     notes : what was chosen or assumed
-    bad_scans : how many scans were left out, once ``scans`` is through or closed
-    times : what was found out about the times of their points; jumps : a line on jumps of the header stamps
-    distortion : that of scans without times, in words, where it is not removed
-    distorted_share : of the motion between scans, by which these may be distorted where nothing removes it
+    bad_scans : number of scans left out, set once ``scans`` is exhausted or closed
+    times : findings on the per-point times; jumps : warnings about jumps or a wrong rate of the header stamps
+    distortion : motion distortion of scans without point times, as text, if it is not removed
+    distorted_share : share of the motion between scans by which they may be distorted, if nothing removes it
     """
 
     _truth: Trajectory | None
@@ -118,7 +118,7 @@ class Log:
         )
         wheels = find_wheels(indexes, self.publishers.frame, config, self.span, self.notes)
         self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
-        self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
+        self.gaps = stream.gap_notes(indexes, config)  # the notes on long gaps
         topic = wheels.channel.topic if wheels else ""
         self.notes += self.publishers.notes + ([self.sectors.note(self.topic)] if self.sectors else [])
         self.notes += stream.notes_on(indexes, config) + (
@@ -149,7 +149,7 @@ class Log:
         return self.scans()
 
     def __getitem__(self, index: int) -> Scan:
-        """The scan of that number, from 0; those before it are read too. Raises InputError where there is none."""
+        """The scan with this index, from 0; all before it are read too. Raises InputError if there is none."""
         number = checks.integer(
             index, "index", "a scan's number, from 0; islice(log, first, last) for some", least=0
         )
@@ -162,7 +162,7 @@ class Log:
         return scan
 
     def _apart(self) -> Log:
-        """The same log, with counts and notes of its own."""
+        """Copy of the log with separate counts and notes."""
         other = copy(self)
         other.publishers = copy(self.publishers)
         other.publishers.known = dict(self.publishers.known)
@@ -170,14 +170,14 @@ class Log:
 
     @property
     def damage(self) -> list[str]:
-        """Damage that was met; complete once ``scans`` is through or closed."""
+        """Damage found so far; complete once ``scans`` is exhausted or closed."""
         return grouped(self._damage)
 
     def scans(self, preprocess: PreprocessConfig | None = None) -> Generator[Scan, None, None]:
-        """Scans in the order of log time, each with the wheels' pose at its stamp.
+        """Scans in the order of log time, each with the wheel odometry pose at its stamp.
 
         A scan that is malformed, has no valid point at all or none in the range that ``preprocess`` retains is
-        counted in ``damage`` and left out, like damaged chunks. Raises InputError when there are more of them
+        left out and reported in ``damage``, as are damaged chunks. Raises InputError if there are more such scans
         than ``log.max_bad_scans_percent`` allows.
         """
         self._damage = [line for index in self.indexes for line in index.damage]
@@ -219,7 +219,7 @@ class Log:
                 index, jump_s = index + 1, 0.0
                 requested_s = working_s()
             self._truth = poses.ground_truth()
-        finally:  # also where the caller wants no more scans
+        finally:  # also if the caller stops early
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
             self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
@@ -233,7 +233,7 @@ class Log:
             self._damage.append(counts.recovered(0 if self.sectors else self.scan_count))
 
     def windows(self, places: Sequence[float], scans: int) -> Iterator[list[Scan]]:
-        """Windows of so many scans, from 0 for the first of the log to 1 for the last; none of a shorter log."""
+        """Windows of ``scans`` scans, at places from 0 (start of the log) to 1 (end); shorter ones are skipped."""
         whole = stream.whole_span(self.indexes)
         begin_ns, end_ns = max(self.span.begin_ns, whole.begin_ns), min(self.span.end_ns, whole.end_ns)
         last_ns = (end_ns - begin_ns) * max(1.0 - scans / max(self.scan_count - 1, 1), 0.0)
@@ -246,12 +246,12 @@ class Log:
                     yield found
 
     def time_points(self, config: LogConfig, note: str) -> None:
-        """Read scans with the point times of another configuration, which the note explains."""
+        """Use the point times of another configuration from now on; ``note`` explains the change."""
         self.config = config
         self._opening_notes += (note,)
 
     def assumed_point_times(self) -> str:
-        """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
+        """Assumption of a run about per-point times, from the first scan with returns; empty for laser scans."""
         times = self._sampled_times
         if self.sectors is not None:
             times = self._point_times()
@@ -261,9 +261,10 @@ class Log:
         return "" if is_scan(self.lidar) else times.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
-        """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
+        """First and last header stamp (2,) expected of a topic in the part that is read, from its first message.
 
-        ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
+        topic : the lidar's or the ground truth's
+        Raises InputError if the topic has no usable message there.
         """
         decode = self.pose_decoders.get(topic) or self.decoder(self._point_times())
         why, unset = "", None
@@ -282,7 +283,7 @@ class Log:
         raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood{why}")
 
     def ground_truth(self) -> Trajectory | None:
-        """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
+        """Poses of ``log.ground_truth_topic`` or None; read separately if ``scans`` is not exhausted."""
         topic = self.ground_truth_topic
         if self._truth is None and topic:
             poses, decoders = RecordedPoses("", topic, self._lidar_on), {topic: self.pose_decoders[topic]}
@@ -292,7 +293,7 @@ class Log:
         return self._truth
 
     def _lidar_on(self, frame: str) -> Pose:
-        """T_frame_lidar (d+1, d+1), the identity where no fixed transform states it."""
+        """T_frame_lidar (d+1, d+1), the identity if no fixed transform gives it."""
         is_other = frame not in ("", self.publishers.frame)
         T = between_frames(self.indexes, self.span, frame, self.publishers.frame) if is_other else None
         T = np.eye(4) if T is None else T
@@ -301,7 +302,7 @@ class Log:
     def _with_poses(
         self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None
     ) -> Iterator[tuple[Decoded, Pose | None]]:
-        """Scans with the wheels' pose at their stamp; they wait a little for the readings behind them."""
+        """Scans with the wheel odometry pose at their stamp; each waits briefly for the next wheel reading."""
         decoders = {self.topic: self.decoder(self.times), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
@@ -324,12 +325,12 @@ class Log:
                 yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
-        """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
+        """Decoder of the lidar's messages to points; ``times`` records what is assumed about the point times."""
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=times.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
 
     def _point_times(self) -> PointTimes:
-        """Times of the lidar's points, in the unit that the duration of a sector shows."""
+        """New reader of point times; if messages are sectors, in the unit inferred from their duration."""
         unit = self.sectors.point_times if self.sectors else self.config.point_times
         return PointTimes(replace(self.config, point_times=unit))

@@ -19,22 +19,22 @@ from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, r
 from scanchain.logs.topics import find_odometry, topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
-# words in names of frames that stand still
+# words in the names of world-fixed frames
 _WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}
-_TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
+_TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # rotation and translation above which two transforms differ
 TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane above which its scans are no floor plan
-_TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
+_TURNED_DEG = 0.5  # least rotation angle of a lidar on its robot that is reported
 
 
 class Mounting(NamedTuple):
     """The pose of a lidar on its robot.
 
-    base : its frame, empty where the log does not state it
-    T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
-    source : of the pose, as text
-    motion : the joint that moves the lidar and how far, as text; None where it stays where it is
-    note : what was assumed, or is contradicted, empty where nothing was
-    is_stated : whether the log states the pose on the base of the wheels
+    base : the robot's frame, empty if the log does not state it
+    T_base_lidar : (4, 4), the first one if the lidar moves; the identity if the log does not state it
+    source : origin of the pose, as text
+    motion : the joint that moves the lidar and how far, as text; None if the lidar does not move
+    note : assumptions, or contradicting transforms; empty if there are none
+    is_stated : whether the log states the pose; False if the base or the pose is assumed
     """
 
     base: str
@@ -46,11 +46,11 @@ class Mounting(NamedTuple):
 
     @property
     def base_name(self) -> str:
-        """Name of the base in print: its frame where that is another than usual."""
+        """Name of the base as text: its frame if that is not a usual one."""
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
 
     def notes(self, wheels: str, dimension: int) -> list[str]:
-        """Assumptions about a lidar of this dimension, and of wheels with this topic."""
+        """Notes on the mounting of a lidar of this dimension, on a robot with this topic of wheel odometry."""
         notes = [self.note] if self.note else []
         if self.motion is not None:
             prior = f"; the wheels ({wheels}) are no prior for it" if wheels else ""
@@ -68,7 +68,7 @@ class Mounting(NamedTuple):
 
 
 class Wheels(NamedTuple):
-    """Wheel odometry: its channel, the same in print, and its two frames where it is a transform among others."""
+    """Wheel odometry: its channel, its description as text, and its two frames if it is a transform of /tf."""
 
     channel: Channel
     text: str
@@ -78,9 +78,10 @@ class Wheels(NamedTuple):
 def find_wheels(
     indexes: Sequence[FileIndex], frame: str, config: LogConfig, span: Span, notes: list[str]
 ) -> Wheels | None:
-    """The wheel odometry: a topic or, without any, the transform from an odometry's frame to the lidar's robot.
+    """Wheel odometry of a log: a topic or, without one, the transform from an odometry frame to the lidar's robot.
 
-    A SLAM's map → odom is none, nor is the lidar's own frame a robot, nor what never changes an odometry.
+    Not taken for odometry: map → odom of a SLAM system, a transform to the lidar's own frame and, unless it is
+    configured, a transform that never changes.
     """
     topic, wanted = find_odometry(indexes, config, notes), config.odometry_topic
     if topic is None or not is_moving_transforms(topic):
@@ -116,14 +117,14 @@ def find_wheels(
 
 
 class MovingFrame(NamedTuple):
-    """A frame and its pose (d+1, d+1) as seen from the lidar."""
+    """A frame and its pose (d+1, d+1) in the lidar's frame."""
 
     name: str
     T_lidar_frame: Pose
 
 
 def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | None, span: Span) -> Mounting:
-    """The mounting of a lidar with this frame, empty if it has none, as the chosen part of a log shows it."""
+    """Mounting of the lidar with ``frame`` (empty if it has none), from the chosen part of a log."""
     base_of_wheels = wheels.link[1] if wheels and wheels.link else ""
     if wheels is not None and role(wheels.channel) == "odometry":
         stated = next(sampled_messages(indexes, wheels.channel.topic, pose_reader(wheels.channel, 3)), None)
@@ -144,13 +145,13 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
 
 
 def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source: str) -> Pose | None:
-    """T_target_source (4, 4) of two frames that do not move against each other, None where the log has none."""
+    """T_target_source (4, 4) of two frames that do not move relative to each other, None if there is none."""
     stated = _stated(indexes, [target], source, span)
     return None if stated is None or stated.motion else stated.T_base_lidar
 
 
 def _stated(indexes: Sequence[FileIndex], bases: Sequence[str], frame: str, span: Span) -> Mounting | None:
-    """The mounting on the first of these frames that static transforms lead to, or else with those of /tf."""
+    """Mounting on the first of ``bases`` connected by static transforms, or else by /tf; None if none is."""
     fixed, rivals = _fixed(indexes)
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
@@ -171,7 +172,7 @@ def _stated(indexes: Sequence[FileIndex], bases: Sequence[str], frame: str, span
 
 
 def _fixed(indexes: Sequence[FileIndex]) -> tuple[list[StampedPose], dict[str, str]]:
-    """Static transforms, the latest of each child as in tf2, and lines on children with others before."""
+    """Static transforms, the latest of each child as in tf2, and warnings, by child, about conflicting ones."""
     latest, rivals = dict[str, StampedPose](), dict[str, str]()
     for each in _transforms(indexes, is_fixed=True):
         before = latest.get(each.child, each)
@@ -185,7 +186,7 @@ def _fixed(indexes: Sequence[FileIndex]) -> tuple[list[StampedPose], dict[str, s
 
 
 def _disagreeing(fixed: Sequence[StampedPose], rivals: dict[str, str], base: str, frame: str) -> str:
-    """Lines on those of these children on which the lidar hangs."""
+    """Warnings about conflicting transforms on the chain from base to lidar, as text."""
     without = {child: [each for each in fixed if each.child != child] for child in rivals}
     return "; ".join(rivals[child] for child, rest in without.items() if chain(rest, base, frame) is None)
 
@@ -193,11 +194,11 @@ def _disagreeing(fixed: Sequence[StampedPose], rivals: dict[str, str], base: str
 def _motion(
     joints: dict[Frames, list[StampedPose]], first: Sequence[StampedPose], base: str, frame: str
 ) -> str | None:
-    """The joint between base and lidar that turns most, and how far, as text; None where none moves."""
+    """The joint between base and lidar that rotates most, and how far, as text; None if none moves."""
     motion, most_rad = None, -1.0
     for joint, poses in joints.items():
         if chain([each for each in first if (each.parent, each.child) != joint], base, frame) is not None:
-            continue  # the lidar does not hang on it
+            continue  # not on the chain from base to lidar
         moved = [lie.apart(poses[0].T_parent_child, pose.T_parent_child) for pose in poses]
         shift_m, turn_rad = np.max(moved, axis=0)
         if (turn_rad > _TURN_RAD or shift_m > _SHIFT_M) and turn_rad > most_rad:
@@ -208,9 +209,9 @@ def _motion(
 
 
 def moving_frame(indexes: Sequence[FileIndex], frame: str, mounting: Mounting, *, dimension: int) -> MovingFrame:
-    """The root of the fixed transforms above the lidar, the lidar's own frame where the log has none.
+    """Root frame of the static transforms above the lidar; the lidar's own frame if the log has none.
 
-    Transforms of /tf that join it to the base and do not change are as good as fixed ones.
+    Transforms of /tf between base and lidar that do not change count as static.
     """
     frame = frame or "lidar"
     transforms, _ = _fixed(indexes)
@@ -223,14 +224,14 @@ def moving_frame(indexes: Sequence[FileIndex], frame: str, mounting: Mounting, *
 
 
 def _root(transforms: Sequence[StampedPose], frame: str) -> str:
-    """The topmost frame above one; the frame itself where it has no parent."""
+    """Topmost ancestor of a frame; the frame itself if it has no parent."""
     return [frame, *_above(frame, {each.child: each.parent for each in transforms})][-1]
 
 
 def _above(frame: str, parents: dict[str, str]) -> Iterator[str]:
-    """The frames above one, by a parent of each."""
+    """Ancestors of a frame, nearest first; ``parents`` by child."""
     while frame in parents:
-        frame = parents.pop(frame)  # so that a circle ends
+        frame = parents.pop(frame)  # so that a cycle ends
         yield frame
 
 
@@ -244,12 +245,12 @@ def is_upside_down(T_base_lidar: Pose) -> bool:
 
 
 def tilt_rad(T: Pose) -> float:
-    """Angle between the planes of two frames, upside down or not."""
+    """Angle between the xy planes of two frames, at most π/2; turning one upside down does not change it."""
     return float(np.arccos(np.clip(abs(T[2, 2]), 0.0, 1.0)))
 
 
 def turned_by(T_base_lidar: Pose) -> str:
-    """Orientation of a lidar on its base as text, by the angles that are not zero; empty without any."""
+    """Orientation of a lidar on its base as text, by its nonzero angles; empty if there are none."""
     T = lie.lift(T_base_lidar)
     pitch_rad = np.arcsin(np.clip(-T[2, 0], -1.0, 1.0))
     angles_deg = np.degrees([np.arctan2(T[2, 1], T[2, 2]), pitch_rad, lie.yaw(T)]).tolist()
@@ -258,7 +259,7 @@ def turned_by(T_base_lidar: Pose) -> str:
 
 
 def place_text(T: Pose) -> str:
-    """A pose (4, 4) as text: its position, and its orientation by the angles that are not zero."""
+    """A pose (4, 4) as text: its position and the nonzero angles of its orientation."""
     at = ", ".join(f"{axis} {value_m:.3f} m" for axis, value_m in zip("xyz", T[:3, 3], strict=True))
     turned = turned_by(T)
     return f"{at}{turned and ', turned by '}{turned}"
@@ -267,8 +268,8 @@ def place_text(T: Pose) -> str:
 def in_plane(T_base_lidar: Pose) -> Pose:
     """T_base_lidar (3, 3) of a planar scanner.
 
-    One that hangs upside down sees the plane mirrored; its points are turned about its own x axis (y → −y), and
-    so is its mounting, so that both are as seen from above.
+    A scanner mounted upside down measures the plane mirrored; its points (y → −y) and its mounting are rotated by
+    π about its own x axis, so that both are as seen from above.
     """
     if is_upside_down(T_base_lidar):
         T_base_lidar = T_base_lidar @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -276,7 +277,7 @@ def in_plane(T_base_lidar: Pose) -> Pose:
 
 
 def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None) -> list[StampedPose]:
-    """Transforms of the topics of fixed ones, or of those that may change, from parts spread over the span."""
+    """Transforms of the static topics, or of those that may change, sampled over the span."""
     found: list[StampedPose] = []
     for channel in topics_of(indexes).values():
         if role(channel) == "transforms" and is_moving_transforms(channel) != is_fixed:

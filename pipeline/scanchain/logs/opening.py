@@ -24,7 +24,7 @@ from scanchain.logs.mcap.index import index_by_summary, index_file
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
 
-FORMATS: dict[str, tuple[str, Callable[..., FileIndex]]] = {  # described as errors list them; see _format_of
+FORMATS: dict[str, tuple[str, Callable[..., FileIndex]]] = {  # with descriptions for errors; see _format_of
     "mcap": ("MCAP", index_file),
     "ros1": ("a ROS 1 .bag", index_ros1_bag),
     "ros2": ("a ROS 2 .db3 or the folder of a ROS 2 bag", index_ros2_bag),
@@ -35,20 +35,20 @@ FORMATS: dict[str, tuple[str, Callable[..., FileIndex]]] = {  # described as err
 }
 _KNOWN = ", ".join(description for description, _ in FORMATS.values())
 _KNOWN += ", or name a class of your own that reads it, --log.format module:Class"
-AUTO = "auto"  # value of log.format: the format that claims the path
+AUTO = "auto"  # value of log.format: the format is recognized from the path
 
 _RUN_FILE, _BAG_FILE = "run.json", "metadata.yaml"
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
 _LOG_SUFFIXES = (*_PART_SUFFIXES, ".log", ".clf", ".bz2", ".gz")
 _POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
-_HEAD_BYTES = 64  # number of bytes of a file's head by which formats claim it
+_HEAD_BYTES = 64  # leading bytes of a file from which its format is recognized
 _DEFAULTS = LogConfig()
 
 
 def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> list[FileIndex]:
-    """Index of each file of a log's files, folders and addresses, every channel known and counted.
+    """Index of each file in a log's files, folders and addresses, with every channel and its message count.
 
-    Raises InputError for what is no log, or cannot be read.
+    Raises InputError for a source that is no log or cannot be read.
     """
     name = config.format
     if name != AUTO and name not in FORMATS:
@@ -75,13 +75,13 @@ def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> lis
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """The logs in a folder, by name; the folder alone where it is one log, or holds the parts of one."""
+    """Logs in a folder, sorted by name; only the folder itself if it is one log or contains the parts of one."""
     if _is_claimed(folder):
         return [folder]
     found = [path for path in sorted(folder.iterdir(), key=natural_order) if _is_named_as_log(path)]
     if len(found) < 2:
         return [folder]
-    try:  # in time they follow one another, or have no topic of a lidar in common
+    try:  # parts of one log: consecutive in time, or without a common lidar topic
         is_one = found == _parts(folder) and are_parts(index_files(found))
     except InputError:
         is_one = False
@@ -99,7 +99,7 @@ def _is_claimed(folder: Path) -> bool:
 
 
 def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
-    """Index of a file; of a remote one without an index of its own that of a copy."""
+    """Index of a file; a remote one that cannot be read in parts by its own index is downloaded first."""
     if isinstance(source, Path):
         return _index_path(source, number, config)
     file = RemoteFile(source)
@@ -143,7 +143,7 @@ def _index_path(path: Path, number: int, config: LogConfig) -> FileIndex:
 
 
 def _format_of(path: Path, head: bytes) -> str:
-    """The format of a path by its first bytes, none of a folder, or what lies in it; empty where it has none."""
+    """Format of a path by its first bytes (empty for a folder) or its contents; empty if none is recognized."""
     claims = {
         "mcap": head.startswith(MCAP0_MAGIC) or not (head or path.is_dir()),  # an empty file is refused as such
         "ros1": head.startswith(b"#ROSBAG"),
@@ -157,7 +157,7 @@ def _format_of(path: Path, head: bytes) -> str:
 
 
 def _claiming(path: Path, head: bytes) -> str:
-    """The format that claims a path. Raises UnknownFormatError, or InputError for a folder that is none."""
+    """Recognized format of a path. Without one raises UnknownFormatError for a file, InputError for a folder."""
     if (path / _RUN_FILE).is_file():
         raise InputError(f"{path}: is a run directory, no log; give the log that its {_RUN_FILE} names")
     if name := _format_of(path, head):
@@ -168,7 +168,7 @@ def _claiming(path: Path, head: bytes) -> str:
 
 
 def _parts(source: Source) -> Sequence[Source]:
-    """The files of a folder that holds the parts of a log, in the order of their names; else the source itself."""
+    """Files of a folder that contains the parts of a log, in order; else the source itself."""
     if not isinstance(source, Path) or not source.is_dir():
         return [source]
     if (source / _BAG_FILE).is_file():

@@ -1,4 +1,4 @@
-"""Publishers of a lidar's topic, told apart by frame, and jumps of the header stamps."""
+"""Publishers of a lidar's topic, distinguished by frame, and jumps of the header stamps."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.lidar import Returns, moved
 from scanchain.logs.mounting import TILTED_RAD, place_text, tilt_rad
 
-_STEP_NS, _STEP_PERIODS = 1_000_000_000, 5  # larger steps of a clock are no jitter; Intel has it up to 0.9 s
-_SAMPLED = 16, 128  # number of messages that show the publishers, of clouds and in the plane
+_STEP_NS, _STEP_PERIODS = 1_000_000_000, 5  # larger clock steps are not jitter (up to 0.9 s in Intel)
+_SAMPLED = 16, 128  # number of messages sampled to find the publishers: of clouds, of planar scans
 _STEADY = 3  # number of scans before and after a jump whose stamps must agree with each other
-_REMEMBERED = 31  # number of scans before a jump
-_TOGETHER_NS = 250_000_000  # of scans of several lidars that are matched as one: the motion in it is even
+_REMEMBERED = 31  # number of scans before a step that it is compared with
+_TOGETHER_NS = 250_000_000  # longest time between scans of several lidars that are matched as one scan
 
 
 class Publisher(NamedTuple):
-    """A publisher: its frame, its pose in that of the first, and how it is used, empty for the first."""
+    """A publisher: its frame, its pose in the first one's frame, and a note on its use, empty for the first."""
 
     frame: str
     T_first_frame: Pose | None = None
@@ -32,7 +32,7 @@ class Publisher(NamedTuple):
 
 
 class Publishers:
-    """Publishers of one topic by frame; points are moved to ``frame``, that of the one with most returns."""
+    """Publishers of one topic by frame; points are moved to ``frame``, that with most nonempty scans."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class Publishers:
         *,
         is_planar: bool,
     ) -> None:
-        """Begin with a sample, of ``most`` messages in a block; ``between`` gives T_target_source of frames."""
+        """Find the publishers of sampled messages, ``most`` per block; ``between`` returns T_target_source."""
         sampled = list(sample(blocks=1, most=_SAMPLED[is_planar]))
         if not any(len(each.value.points) for each in sampled):
             sampled = list(sample())  # from all over the log
@@ -58,7 +58,7 @@ class Publishers:
 
     @property
     def notes(self) -> list[str]:
-        """Lines on all but the first one."""
+        """Notes on all publishers except the first."""
         return [publisher.note for publisher in self.known.values() if publisher.note]
 
     def of(self, frame: str) -> Publisher:
@@ -85,7 +85,7 @@ class Publishers:
         return Publisher(frame, None, why, is_used=False)
 
     def _away_ns(self, frame: str) -> int:
-        """Difference of its clock to that of the first, the median of messages that follow each other."""
+        """Median offset of the clock of ``frame`` from that of the first publisher, over consecutive messages."""
         of_both = [each for each in self.offsets_ns if each[0] in (frame, self.frame)]
         signs = {frame: 1, self.frame: -1}
         away_ns = sorted((b - a) * signs[g] for (f, a), (g, b) in pairwise(of_both) if f != g)
@@ -95,7 +95,10 @@ class Publishers:
 def seen_together(
     returns: Returns, publishers: Publishers, latest: dict[str, tuple[int, OtherPoints]], *, is_mirrored: bool
 ) -> tuple[RawPoints, OtherPoints | None]:
-    """Points of a scan in the frame of the first, and those of others just before it, by ``latest`` of each."""
+    """Points of a scan in the first publisher's frame, and those of other publishers just before it.
+
+    latest : header stamp and points of the last scan of each frame; updated
+    """
     points, times_s = moved(returns.points, publishers.of(returns.frame).T_first_frame), returns.times_s
     points = points * np.array([1.0, -1.0], np.float32) if is_mirrored else points
     if len(publishers.known) < 2:
@@ -111,10 +114,10 @@ def seen_together(
 
 
 def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tuple[Decoded, Pose | None, float]]:
-    """Messages with the seconds by which their stamps jump since the one before; 0 as a rule.
+    """Messages with the jump of their stamp since the previous one, in seconds; usually 0.
 
-    A step back, or one ahead that the log does not take, is a jump if the stamps before and after it are as far
-    from the log as ever, but for the step: single wrong stamps, jitter and late messages are none.
+    A step back, or a step ahead that the log times do not show, is a jump if the next scans' offsets from log time
+    to stamp have all shifted too: single wrong stamps, jitter and late messages are not jumps.
     """
     before: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
     waiting: deque[tuple[Decoded, Pose | None]] = deque()
@@ -132,7 +135,7 @@ def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tupl
 
 
 def _times(message: Decoded) -> tuple[int, int] | None:
-    """Stamp of a scan, and its offset against the log; None without a stamp or a point."""
+    """Stamp of a scan and its offset from the log time; None without a stamp or a point."""
     returns = message.value
     if not isinstance(returns, Returns) or not len(returns.points) or not returns.stamp_ns:
         return None
@@ -140,8 +143,8 @@ def _times(message: Decoded) -> tuple[int, int] | None:
 
 
 def _jump_s(before: Sequence[tuple[int, int]], after: Sequence[tuple[int, int]]) -> float:
-    """Seconds of a jump by ``_times`` of the scans on both sides, 0 where it is none."""
-    stamps_ns, offsets_ns = np.array(before, np.float64).T  # times of a damaged log exceed integers
+    """Size of a jump in seconds, from ``_times`` of the scans before and after it; 0 if it is none."""
+    stamps_ns, offsets_ns = np.array(before, np.float64).T  # times of a damaged log may overflow integers
     step_ns, after_ns = after[0][0] - before[-1][0], [offset_ns for _, offset_ns in after]
     limit_ns = max(_STEP_NS, _STEP_PERIODS * float(np.median(np.diff(stamps_ns))))
     is_back = step_ns < -limit_ns and max(after_ns) < np.median(offsets_ns) - limit_ns

@@ -1,4 +1,4 @@
-"""Messages that are sectors of a revolution: recognized among the first ones, and assembled to sweeps."""
+"""Messages that are sectors of a revolution: detected from the first messages, and assembled into sweeps."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 
-_SAMPLE = 250  # points of a message, evenly spread, by which its direction and width are estimated
+_SAMPLE = 250  # points of a message, evenly sampled, from which its direction and width are estimated
 _TURN_RAD = 2.0 * np.pi
-_WIDEST_RAD = 4.0 / 3.0 * np.pi  # of a message above which it is a sweep by itself
-_FEWEST = 3  # messages that show a lidar which looks in one direction
-MOST = 1000  # messages of the sample, none of which is read once it is clear that each is a sweep
-_REVOLUTIONS = 2.0  # least number that the sample shows
-_WIDTHS = (0.5, 1.5)  # width of a message over the angle to the next: less leaves holes, more is no sector
-_REGULAR = 0.6  # least share of messages that follow by the usual angle, not a blind angle or missing ones
-_SLOWEST_S = 1.5  # longest revolution of a lidar; what turns more slowly may be the robot
-_CLEAR_RAD = 2.0 / 3.0 * np.pi  # angle between messages up to which it shows by itself which way they turn
-_SAME = 0.1  # share of that angle up to which a message a revolution later looks in the same direction
-_MISSING = 0.75  # revolutions of time without messages, above which a gap ends the sweep
+_WIDEST_RAD = 4.0 / 3.0 * np.pi  # angular width of a message above which it is a sweep by itself
+_FEWEST = 3  # number of messages after which a lidar that always faces one direction is recognized
+MOST = 1000  # largest number of messages sampled; sampling stops once each is clearly a sweep by itself
+_REVOLUTIONS = 2.0  # least number of revolutions in the sample
+_WIDTHS = (0.5, 1.5)  # limits of a message's width over the angle to the next: less leaves gaps, more is no sector
+_REGULAR = 0.6  # least share of messages at the usual angle to the next, without a blind sector or lost messages
+_SLOWEST_S = 1.5  # longest revolution of a lidar; a slower rotation may be the robot's
+_CLEAR_RAD = 2.0 / 3.0 * np.pi  # angle between messages up to which its sign is the sense of rotation
+_SAME = 0.1  # share of that angle within which a message one revolution later has the same direction
+_MISSING = 0.75  # length of a gap, in revolutions, above which it ends the sweep
 
 
 class Sectors(NamedTuple):
@@ -33,10 +33,10 @@ class Sectors(NamedTuple):
 
     sense : 1 if it turns counterclockwise, −1 if clockwise
     step_rad : usual angle from one message to the next
-    per_sweep : messages per revolution, not whole where they do not divide it
-    period_s : of a revolution
-    point_times : ``log.point_times`` of the messages, the unit by the duration of a sector
-    assumed : times by the azimuth, of points that have none of their own; empty where they have
+    per_sweep : messages per revolution, not an integer if they do not divide it evenly
+    period_s : duration of a revolution
+    point_times : ``log.point_times`` for the messages, its unit inferred from the duration of a sector
+    assumed : note that point times are computed from azimuth; empty if points have their own
     """
 
     sense: int
@@ -47,20 +47,20 @@ class Sectors(NamedTuple):
     assumed: str = ""
 
     def note(self, topic: str) -> str:
-        """The sectors in words, and what is done about them."""
+        """Description of the sectors and of their assembly, as text."""
         holds = f"each message holds {360.0 / self.per_sweep:.3g}° of a revolution"
         return f"{topic}: {holds}: {self.per_sweep:.3g} messages are assembled to one sweep"
 
 
 def expected_sweeps(messages: int, sectors: Sectors | None) -> int:
-    """Number of sweeps that so many messages make, an incomplete one at the end only above half of one."""
+    """Number of sweeps in ``messages`` messages; an incomplete last one counts if it is at least half."""
     return messages if sectors is None else max(int(messages / sectors.per_sweep + 0.5), 1)
 
 
 def find_sectors(sample: Iterable[Returns], point_times: str) -> Sectors | None:
-    """Sectors in which consecutive messages of one frame look, which recur; None where each is a sweep by itself.
+    """Sectors that consecutive messages of one frame cover in turn; None if each message is a sweep by itself.
 
-    point_times : as configured
+    point_times : ``log.point_times`` as configured
     """
     seen: list[Returns] = []
     directions_rad, widths_rad, steps_rad = list[float](), list[float](), np.empty(0)
@@ -83,7 +83,7 @@ def find_sectors(sample: Iterable[Returns], point_times: str) -> Sectors | None:
 
 
 def _sectors(seen: Sequence[Returns], directions_rad: NDArray[np.float64], width_rad: float) -> Sectors | None:
-    """Sectors by the directions (N,) of the first messages, None where these do not turn steadily."""
+    """Sectors from the directions (N,) of the first messages; None if these do not rotate steadily."""
     steps_rad = _wrapped(np.diff(directions_rad))
     sense = int(np.sign(np.median(steps_rad)))
     if np.median(np.abs(steps_rad)) > _CLEAR_RAD:
@@ -105,15 +105,15 @@ def _sectors(seen: Sequence[Returns], directions_rad: NDArray[np.float64], width
     if not 0.0 < period_s < _SLOWEST_S:
         return None
     per_sweep = float(_TURN_RAD / np.mean(steps_rad))
-    if np.median(np.abs(drift_rad)) < _SAME * step_rad:  # the same sectors again: as many as there are
+    if np.median(np.abs(drift_rad)) < _SAME * step_rad:  # the same sectors recur: a whole number of them
         per_sweep = float(np.max(later - first))
     return Sectors(sense, step_rad, per_sweep, period_s)
 
 
 def _timed(sectors: Sectors, seen: Sequence[Returns], configured: str) -> Sectors:
-    """The sectors with the unit of their point times: that in which a message lasts about as long as a sector.
+    """Sectors with the unit of their point times: that in which a message lasts about as long as a sector.
 
-    They are not used where they count from the beginning of the revolution, or only this has a stamp.
+    Point times are ignored if they count from the start of the revolution, or if only the revolution is stamped.
     """
     point_times = configured if configured in (*UNITS_S, "auto") else "none"
     if configured == "auto":
@@ -127,14 +127,14 @@ def _timed(sectors: Sectors, seen: Sequence[Returns], configured: str) -> Sector
     is_from_sweep = len(starts_s) > 1 and float(np.ptp(starts_s)) > 0.5 * last_s
     is_stamped = np.median(np.diff([each.stamp_ns for each in seen])) > 0
     point_times = point_times if is_stamped and not is_from_sweep else "none"
-    turn = f"{'counterclockwise' if sectors.sense > 0 else 'clockwise'}, {sectors.period_s:.3g} s a turn"
+    turn = f"{'counterclockwise' if sectors.sense > 0 else 'clockwise'}, {sectors.period_s:.3g} s per turn"
     by_azimuth = f"point times by the azimuth: {turn}, from the sweep's first stamp"
     is_own = bool(starts_s) and point_times != "none"
     return sectors._replace(point_times=point_times, assumed="" if is_own else by_azimuth)
 
 
 class _Part(NamedTuple):
-    """A message, or a part of one, in a sweep: its direction, and its middle since the sweep was due to begin."""
+    """A message, or part of one, in a sweep: the angle of its middle from the nominal start, and its azimuth."""
 
     message: Decoded
     returns: Returns
@@ -143,7 +143,7 @@ class _Part(NamedTuple):
 
 
 class Assembler:
-    """Sweeps of the messages that are sectors of them; ``incomplete`` counts those left out."""
+    """Assembly of sector messages into sweeps; ``incomplete`` counts the sweeps left out."""
 
     def __init__(self, sectors: Sectors, topic: str, times: PointTimes) -> None:
         self.sectors, self.topic, self.times = sectors, topic, times
@@ -152,11 +152,11 @@ class Assembler:
         self.incomplete = 0
 
     def sweeps(self, messages: Iterable[Decoded]) -> Iterator[Decoded]:
-        """The messages, those of the lidar assembled to sweeps; malformed ones and those of other topics pass.
+        """Messages, those of the lidar assembled into sweeps; malformed ones and other topics pass unchanged.
 
-        A sweep has the stamp of its beginning and the log time of its last message. It ends where the revolution
-        does, which splits a message where they do not divide it, or where those of most of a revolution are
-        missing. One over less than half of a revolution is left out.
+        A sweep has the stamp of its beginning and the log time of its last message. It ends with the revolution,
+        which splits a message if messages do not divide it evenly, or at a gap of most of a revolution. A sweep of
+        less than half a revolution is left out.
         """
         parts: list[_Part] = []
         for message in messages:
@@ -178,9 +178,9 @@ class Assembler:
         yield from self._complete(parts)
 
     def _following(self, last: _Part | None, message: Decoded, returns: Returns) -> tuple[_Part, bool]:
-        """The part that follows another, and whether messages are missing between them, or its clock steps back.
+        """Part of the next message; True with it if messages before it are missing or its clock steps back.
 
-        Messages without points follow by the usual angle.
+        A message without points is placed at the usual angle from the last one.
         """
         sectors = self.sectors
         direction_rad = last.direction_rad + sectors.sense * sectors.step_rad if last else 0.0
@@ -196,7 +196,7 @@ class Assembler:
         return (part if is_apart else part._replace(angle_rad=last.angle_rad + turned_rad)), is_apart
 
     def _complete(self, parts: list[_Part]) -> Iterator[Decoded]:
-        """The sweep of its parts, none where these cover less than half of a revolution."""
+        """Sweep assembled from its parts; none if these cover less than half a revolution."""
         if not parts:
             return
         first, last, returns = parts[0], parts[-1], [part.returns for part in parts]
@@ -204,7 +204,7 @@ class Assembler:
         if last.angle_rad + self.half_rad - begin_rad < 0.5 * _TURN_RAD - _SAME * self.half_rad:
             self.incomplete += 1
             return
-        begin_s = self.rate * (begin_rad - (first.angle_rad - self.half_rad))  # after the stamp of the first
+        begin_s = self.rate * (begin_rad - (first.angle_rad - self.half_rad))  # relative to the stamp of the first
         begin_ns = first.returns.stamp_ns + round(1e9 * begin_s)
         points = np.concatenate([each.points for each in returns])
         times_s = np.concatenate([self._times_s(part, begin_rad, begin_ns) for part in parts])
@@ -213,7 +213,7 @@ class Assembler:
         yield last.message._replace(value=sweep)
 
     def _times_s(self, part: _Part, begin_rad: float, begin_ns: int) -> NDArray[np.float32]:
-        """Seconds (N,) of points after the beginning of their sweep: by their own times, else by their angle."""
+        """Times (N,) of a part's points since the beginning of the sweep: their own, else from their angle."""
         if not self.times.assumed.startswith("point times") and len(part.returns.points):
             self.times.assumed = "" if len(part.returns.times_s) else self.sectors.assumed
         if len(part.returns.times_s):
@@ -221,19 +221,19 @@ class Assembler:
         return (self.rate * (self._angles_rad(part) - begin_rad)).astype(np.float32)
 
     def _angles_rad(self, part: _Part) -> NDArray[np.float32]:
-        """Angles (N,) of the points of a part, since its sweep was due to begin."""
+        """Angles (N,) of the points of a part from the nominal start of its sweep, in the sense of rotation."""
         turned_rad = _wrapped(_azimuth(part.returns.points) - np.float32(part.direction_rad))
         return np.float32(part.angle_rad) + self.sectors.sense * turned_rad
 
     def notes(self) -> list[str]:
-        """A line on sweeps that were left out."""
+        """Note on sweeps that were left out."""
         sweeps = f"{counted(self.incomplete, 'sweep')} of {self.topic}"
         left_out = f"{sweeps} left out: less than half of a revolution, before a gap or the end"
         return [left_out] if self.incomplete else []
 
 
 def _chosen(part: _Part, chosen: NDArray[np.bool_], dropped: int) -> _Part:
-    """Some points of a part."""
+    """The part, reduced to the points chosen by a mask (N,)."""
     points, times_s = part.returns.points[chosen], part.returns.times_s[chosen[: len(part.returns.times_s)]]
     return part._replace(returns=part.returns._replace(points=points, times_s=times_s, dropped=dropped))
 
@@ -243,19 +243,19 @@ def _azimuth(points: RawPoints) -> NDArray[np.float32]:
 
 
 def _direction(points: RawPoints) -> float:
-    """Mean azimuth of points (N, d), by some of them."""
+    """Mean azimuth of points (N, d), from a sample of them."""
     x, y = points[:: len(points) // _SAMPLE + 1, :2].T
     ranges_m = np.maximum(np.hypot(x, y), np.finfo(np.float32).tiny)
     return float(np.arctan2((y / ranges_m).sum(), (x / ranges_m).sum()))
 
 
 def _wrapped(angle_rad: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Angles from −π to π."""
+    """Angles wrapped to −π to π."""
     return (angle_rad + np.pi) % _TURN_RAD - np.pi
 
 
 def _order(returns: Returns) -> float:
-    """Covariance of azimuth and time, or else order, of the points of a message: positive counterclockwise."""
+    """Sign of the covariance of azimuth and time (else point order) in a message; positive counterclockwise."""
     turned_rad = _wrapped(_azimuth(returns.points) - _direction(returns.points))
     times_s = returns.times_s if len(returns.times_s) else np.linspace(0.0, 1.0, len(turned_rad))
     return float(np.sign(np.mean(turned_rad * (times_s - np.mean(times_s)))))

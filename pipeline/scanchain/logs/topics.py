@@ -1,4 +1,4 @@
-"""Choice of a log's topics of lidar and wheels, and its other sensors."""
+"""Choice of a log's lidar and wheel odometry topics, and its other sensors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
 
 
 def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
-    """The lidar's channel: the configured topic, else the only one that fits. Raises InputError."""
+    """The lidar's channel: the configured topic, else the only lidar's. Raises InputError without a unique one."""
     channels = topics_of(indexes)
     name = name_of(indexes)
     lidars = [channel for channel in channels.values() if is_lidar(channel)]
@@ -49,9 +49,9 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 
 
 def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[str]) -> Channel | None:
-    """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses.
+    """The wheel odometry's channel: the configured topic, else the only one other than ground truth.
 
-    Without any, the first of transforms that move, among which it may be.
+    None if there are several. Without any, the first topic of moving transforms, which may contain it.
     """
     moving = [each for each in topics_of(indexes).values() if is_moving_transforms(each)]
     if named := [each for each in moving if each.topic == config.odometry_topic]:
@@ -68,7 +68,7 @@ def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[s
 
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | None:
-    """The ground truth's channel, None for ``NO_TRUTH``; only a topic that is not the usual one must exist."""
+    """The ground truth's channel, None for ``NO_TRUTH``; only the default topic may be missing."""
     if wanted == NO_TRUTH:
         return None
     usual = topics_of(indexes).get(_USUAL_TRUTH)
@@ -79,7 +79,7 @@ def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | No
 
 @dataclass(frozen=True, slots=True)
 class OtherSensor:
-    """A topic beside lidar and wheels: its sensor, and its use by a run."""
+    """A topic other than those of lidar and wheels: its sensor, and its use by a run."""
 
     sensor: str
     topic: str
@@ -87,7 +87,7 @@ class OtherSensor:
 
 
 def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> list[OtherSensor]:
-    """IMU, GNSS and poses of a log whose wheels and ground truth have these topics."""
+    """Ground truth, IMU, GNSS and other poses of a log; ``wheels`` and ``truth`` are the topics of these."""
     found = []
     for topic, channel in topics_of(indexes).items():
         if topic == truth:
@@ -112,7 +112,7 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
 
 
 def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> str:
-    """Channels with their types and, of several files, the first that each is in."""
+    """Channels as text, with their types and, if there are several files, the first that contains each."""
     names = []
     for channel in channels:
         unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"

@@ -1,4 +1,4 @@
-"""ROS 2 messages packed in CDR, and the MCAP logs that they are written to, without ROS."""
+"""ROS 2 messages serialized as CDR, and the MCAP logs they are written to; ROS is not needed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages.ros import NUMBERS, header, new, packed, point_fields, typestore
 
-LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
+LATEST_NS = (1 << 31) * 1_000_000_000  # upper limit of ROS stamps
 _NUMBER_TYPES = {code: number for number, code in NUMBERS.items()}
 
 
@@ -46,7 +46,7 @@ def pack_laser_scan(
     time_increment_s: float = 0.0,
     scan_time_s: float = 0.0,
 ) -> bytes:
-    """A sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
+    """A sensor_msgs/LaserScan; ranges (N,), inf for no return; the stamp is that of the first beam."""
     angle_max_rad = angle_min_rad + (len(ranges_m) - 1) * angle_increment_rad
     angles_rad = angle_min_rad, angle_max_rad, angle_increment_rad
     limits = time_increment_s, scan_time_s, range_min_m, range_max_m
@@ -67,7 +67,7 @@ def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
 def pack_odometry(
     stamp_ns: int, frame: str, child_frame: str, pose: Any, covariance: Matrix | None = None
 ) -> bytes:
-    """A nav_msgs/Odometry: place of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
+    """A nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
     spread = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel()
     posed = new("geometry_msgs/msg/PoseWithCovariance", pose, spread)
     still = new("geometry_msgs/msg/Twist", *[new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)] * 2)
@@ -76,7 +76,7 @@ def pack_odometry(
 
 
 class Link(NamedTuple):
-    """The place of the frame ``child`` in ``parent``."""
+    """Pose of the frame ``child`` in ``parent``."""
 
     parent: str
     child: str
@@ -93,7 +93,7 @@ def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
 
 
 def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Any]) -> bytes:
-    """A nav_msgs/Path: places in ``frame``, each with its own stamp."""
+    """A nav_msgs/Path: poses in ``frame``, each with its own stamp."""
     stamped = [
         new("geometry_msgs/msg/PoseStamped", header(each_ns, frame), pose)
         for each_ns, pose in zip(stamps_ns, poses, strict=True)
@@ -113,7 +113,7 @@ def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: 
 def schema_text(name: str) -> bytes:
     """The definition of ``pkg/msg/Type`` followed by those of every type it uses, as rosbag2 writes it.
 
-    Empty for a type that ROS 2 does not bring.
+    Empty for a type that is not part of ROS 2.
     """
     from rosbags.typesys import TypesysError
 
@@ -127,7 +127,7 @@ CHUNK_BYTES = 4 * 1024 * 1024
 
 
 class LogWriter:
-    """A new log; a context manager. It takes its name only when complete, an exception leaves nothing behind.
+    """Writer of a new log, a context manager. The file gets its name only when complete; errors leave none behind.
 
     Messages are recorded at ``log_time_ns``, by default their own stamp.
     """
@@ -164,7 +164,7 @@ class LogWriter:
         finally:
             if isinstance(error, OSError) and error.filename is None:
                 error.filename = str(self.destination)
-            with suppress(OSError):  # what is buffered still, on a full disk
+            with suppress(OSError):  # flushing buffered data fails on a full disk
                 self._stream.close()
             self._partial.unlink(missing_ok=True)
 
@@ -189,8 +189,8 @@ class LogWriter:
         self.copy(channel, stamp_ns if log_time_ns is None else log_time_ns, data)
 
     def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
-        """Append a message of another log as it is, with its topic, type, encoding and definition."""
-        schema = 0  # which stands for none
+        """Append a message of another log unchanged, with its topic, type, encoding and definition."""
+        schema = 0  # stands for none
         if channel.type_name or channel.definition:
             schema = self._schema(channel.type_name, channel.schema_encoding, channel.definition)
         number = self._channel(channel.topic, channel.encoding, schema)

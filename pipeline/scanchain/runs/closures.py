@@ -1,4 +1,4 @@
-"""Verdicts on loop closures, by verification and by the back end; loops.parquet, one row a closure tried."""
+"""Verdicts on loop closures, by verification and by the back end; loops.parquet, one row per closure tried."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[Closure, ...]:
     """Every closure with its final verdict, weight and χ²; those the graph contradicts are rejected.
 
-    A closure accepted since the optimization that ``state`` comes from stays accepted.
+    A closure accepted after the optimization that gave ``state`` stays accepted.
     """
     edges, final = _loop_edges(state), []
     for closure in closures:
@@ -54,7 +54,7 @@ def write_closures(path: Path, closures: Sequence[Closure], keyframes: Sequence[
 
 
 def closures_table(closures: Sequence[Closure], keyframes: Sequence[Keyframe], dimension: int) -> pa.Table:
-    """Every closure tried, with its final verdict and the robust weight that the optimizer left to it."""
+    """Every closure tried, with its final verdict and its robust weight after optimization."""
     import pyarrow as pa
 
     def of(items: Sequence[object], kind: pa.DataType, *names: str, null_nan: bool = False) -> dict[str, pa.Array]:

@@ -16,25 +16,25 @@ import psutil
 from scanchain.errors import InputError
 
 RUN_FILE = "run.json"
-TRUTH_FILE = "ground_truth.tum"  # true poses during the run, as they were given
+TRUTH_FILE = "ground_truth.tum"  # ground-truth poses during the run, as given
 CHECKPOINT_FILE = "state.checkpoint"  # of a run that is not complete
 RECORDING_FILE = "recording.rrd"
-POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
+POINTS_FILE = "points.store"  # next to the checkpoint: points kept on disk instead of in memory
 _UNFINISHED = "unfinished"
 
 
 class RunDirectory:
     """A new run directory; a context manager.
 
-    It is written beside its destination, as ``NAME.partial-PID``, and takes its name in ``complete``. Left before
-    that, it stays where it is if ``worth_keeping`` was called, else nothing remains. A directory that is replaced
-    stays untouched until the new one is complete.
+    It is written next to its destination, as ``NAME.partial-PID``, and renamed by ``complete``. If the context
+    ends before that, it stays where it is if ``worth_keeping`` was called, else it is removed. A directory that is
+    replaced stays untouched until the new one is complete.
 
-    destination : the name it will have; path : where its files are now
+    destination : final path; path : current path
     """
 
     def __init__(self, destination: Path, *, force: bool, left: Path | None = None) -> None:
-        """Left : a directory marked partial to resume in, instead of an empty one."""
+        """``left`` is a directory marked partial to resume in, instead of an empty one."""
         _check(destination, force)
         self.left = left
         self.destination = destination.resolve()
@@ -45,7 +45,7 @@ class RunDirectory:
     def __enter__(self) -> Self:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            if self.path.exists() and self.path != self.left:  # a dead process had the same number
+            if self.path.exists() and self.path != self.left:  # of a dead process with the same PID
                 shutil.rmtree(self.path)
             if self.left is None:
                 self.path.mkdir()
@@ -86,14 +86,14 @@ class RunDirectory:
             shutil.rmtree(folder, ignore_errors=True)
 
     def complete(self) -> None:
-        """Give the directory its name, without what resuming needs; one that had it before is removed only now.
+        """Rename the directory to its destination, without the checkpoint; a replaced one is removed only now.
 
-        Raises InputError where one that must not be replaced has come to be in the meantime.
+        Raises InputError if a directory that must not be replaced has been created there in the meantime.
         """
         _check(self.destination, self.force)
         if self.destination.exists():
             self.destination.rename(self.destination.with_name(f"{self.destination.name}.replaced-{os.getpid()}"))
-        for file in (CHECKPOINT_FILE, POINTS_FILE):  # not before: until here a kill leaves what --resume needs
+        for file in (CHECKPOINT_FILE, POINTS_FILE):  # only now: --resume needs them after a kill before this line
             (self.path / file).unlink(missing_ok=True)
         self.path.rename(self.destination)
         self.path = self.destination
@@ -103,28 +103,28 @@ class RunDirectory:
 
 
 def partial_runs(destination: Path) -> list[Path]:
-    """Directories that runs into ``destination`` left, or write now, by name."""
+    """Partial directories of runs into ``destination``, stopped or still running, sorted by name."""
     destination = destination.resolve()
     return sorted(destination.parent.glob(f"{escape(destination.name)}.partial-*"))
 
 
 def left_behind(destination: Path) -> Path | None:
-    """That of them with the latest checkpoint, None where no run came that far."""
+    """The one of ``partial_runs`` with the latest checkpoint; None if none has a checkpoint."""
     files = [path / CHECKPOINT_FILE for path in partial_runs(destination) if (path / RUN_FILE).is_file()]
     checkpoints = [file for file in files if file.is_file()]
     return max(checkpoints, key=lambda file: file.stat().st_mtime_ns).parent if checkpoints else None
 
 
 def stopped_run(destination: Path) -> Path | None:
-    """The same, None where another process still writes to it."""
+    """The directory of ``left_behind``; None if another process still writes to it."""
     left = left_behind(destination)
     return left if left is not None and not writer_of(left) else None
 
 
 def writer_of(partial: Path) -> int:
-    """Number of another process that still writes to a directory marked partial, 0 if none does.
+    """PID of another process that still writes to a directory marked partial, 0 if there is none.
 
-    One that began after the file was written has its number by chance.
+    A process that started after the run file was written has the same PID by chance.
     """
     number = partial.name.rpartition("-")[2]
     if not number.isdigit() or int(number) == os.getpid():
@@ -133,14 +133,14 @@ def writer_of(partial: Path) -> int:
     try:
         process = psutil.Process(int(number))
         is_alive = process.status() != psutil.STATUS_ZOMBIE
-        written_s = (run_file if run_file.exists() else partial).stat().st_mtime  # or it has just been made
+        written_s = (run_file if run_file.exists() else partial).stat().st_mtime  # a new one has no run file yet
         return int(number) if is_alive and process.create_time() < written_s else 0
     except (psutil.Error, FileNotFoundError):
         return 0
 
 
 def check_outside_runs(destination: Path) -> None:
-    """Refuse a directory within that of a run, which is replaced as a whole. Raises InputError."""
+    """Raise InputError for a path inside a run directory, since that is replaced as a whole."""
     for folder in destination.resolve().parents:
         file = folder / RUN_FILE
         if file.is_file() and b'"scanchain"' in file.read_bytes():

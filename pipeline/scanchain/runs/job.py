@@ -13,7 +13,7 @@ from scanchain.files import Source
 from scanchain.settings import Override
 
 SinkName = Literal["save", "spawn", "connect", "web"]
-Recorder = Any  # a Recording of scanchain_viz, which stands above runs: its type cannot be named here
+Recorder = Any  # a Recording of scanchain_viz, which imports this package: the type cannot be imported here
 OpenRecorder = Callable[..., AbstractContextManager[Recorder]]
 
 
@@ -23,13 +23,13 @@ class Job:
 
     logs : the files of one log
     out : the run directory
-    config_file : on top of the preset; overrides : on top of both
+    config_file : settings that override the preset; overrides : settings that override both
     sinks : where the recording goes
-    ground_truth : a TUM or KITTI file; None where the log's own is good
-    max_gap_s : between true poses to interpolate over; None for the default
-    force : whether a run directory of that name is replaced
+    ground_truth : a TUM or KITTI file; None to use the log's own, if it has one
+    max_gap_s : longest gap between true poses to interpolate over; None for the default
+    force : whether an existing run directory is replaced
     resume : whether to resume from the last checkpoint of a run that was killed, if there is one
-    checkpoint_s : seconds between two checkpoints, or more where they are large
+    checkpoint_s : minimum seconds between two checkpoints; more where writing one takes long
     command : the command line, for run.json
     """
 
@@ -47,7 +47,7 @@ class Job:
 
 
 class Progress:
-    """Progress of a run or a batch, for scripts: nothing is shown, and nobody ends it early."""
+    """Progress of a run or a batch, for scripts: shows nothing and never ends it early."""
 
     stopped = False  # whether the user has ended the run early
 
@@ -58,11 +58,11 @@ class Progress:
         """Show a line on a terminal or in a pipe."""
 
     def compiling(self, done: int, total: int) -> None:
-        """Show that so many of all kernels are compiled."""
+        """Show that ``done`` of ``total`` kernels are compiled."""
 
     def count(self, done: int, total: int) -> None:
-        """Show that so many of all are done."""
+        """Show that ``done`` of ``total`` items are done."""
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
-        """Pass the scans on, of which there should be ``count``, until they end or the user stops."""
+        """The same scans, ``count`` expected, until they end or the user stops the run."""
         return scans

@@ -21,16 +21,16 @@ from scanchain.slam import SlamResult
 from scanchain.verdict import Judged, Stretch, Verdict
 
 METRICS_FILE = "metrics.json"
-VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and begin of the reasons below it
+VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and indent of the reasons below it
 _FIRST = 3  # number of reasons that a terminal shows
-_BY_STAGE = ("ms per scan", "  median", "  95th perc.")  # lines that it does not
+_BY_STAGE = ("ms per scan", "  median", "  95th perc.")  # first words of lines that it omits
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
 class Accuracy(Struct, frozen=True):
-    """A trajectory against the ground truth; what the path is too short for is null.
+    """Accuracy of a trajectory against the ground truth; figures that need a longer path are null.
 
-    Of the scans, ``pairs`` have a true pose; ``missing`` counts the others, with the reason, empty if all have.
+    ``pairs`` is the number of scans with a true pose; ``missing`` states how many have none and why, or is empty.
     """
 
     pairs: int
@@ -49,7 +49,7 @@ class Accuracy(Struct, frozen=True):
 class GroundTruth(Struct, frozen=True):
     """Accuracy of a run against the ground truth, after and before optimization.
 
-    ``max_gap_s`` : between true poses to interpolate over, as requested; null for the default
+    ``max_gap_s`` : longest gap between true poses to interpolate over, as requested; null for the default
     """
 
     source: str
@@ -66,24 +66,24 @@ class GroundTruth(Struct, frozen=True):
 
 
 class Metrics(Struct, frozen=True):
-    """Figures of a run; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
+    """Figures of a run; ``*_ms`` are per scan, by stage; the residual is null where nothing was matched.
 
-    No time but ``compile_s`` counts the compilation of kernels, which happens once after an installation.
+    Only ``compile_s`` includes the compilation of kernels, which happens once after an installation.
     Closures tried = rejected by verification + verified; verified = rejected by the back end + accepted.
-    ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
-    ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
+    ``chi2`` and its degrees of freedom are those of the edges in force, which are the edges in graph.g2o.
+    ``stopped`` is the reason why a run ended before its log; these figures are of the scans before. Else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
-    ``expected_ate_m`` is the ATE as far as it is known without the truth; null where the graph has no edge or its
-    edges leave poses free.
+    ``expected_ate_m`` is the ATE estimated without ground truth; null where the graph has no edge or its edges do
+    not constrain all poses.
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``verdict_error`` the error
-    estimate, ``stretches`` are what to look at.
-    ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
-    ``calibrated_from`` on; 0 where no error was found; ``elevation_sigma_rad`` its standard deviation, null where
-    none was estimated.
+    estimate, ``stretches`` the suspicious segments to check.
+    ``elevation_offset_rad`` is the correction of the lidar's vertical angles from the scan ``calibrated_from`` on;
+    0 where no error was found; ``elevation_sigma_rad`` its standard deviation, null where none was estimated.
     ``odometry_errors`` : drift, slips and jumps of odometry that loop closures show, corrected in the graph
-    ``range_noise_m`` : standard deviation of the ranges by the first scans, null where unknown; ``range_noise`` by
-    range, in words; ``distortion`` that of scans without times, in words, where it is not removed
-    ``warnings`` : data lost, skipped or wrong, a line each
+    ``range_noise_m`` : standard deviation of the ranges, estimated on the first scans; null where unknown
+    ``range_noise`` : the same by range, in words
+    ``distortion`` : motion distortion of scans without point times, in words, where it is not removed
+    ``warnings`` : data lost, skipped or wrong, one line each
     """
 
     scans: int
@@ -133,7 +133,7 @@ class Metrics(Struct, frozen=True):
 
     @property
     def expected_ate(self) -> str:
-        """Expected ATE as text; no covariance knows of what the verdict doubts."""
+        """Expected ATE as text, with a condition unless the verdict is ``TRUSTWORTHY``."""
         if self.expected_ate_m is None:
             return "unknown: the pose graph has no edge, or its edges leave poses free"
         condition = {
@@ -146,7 +146,7 @@ class Metrics(Struct, frozen=True):
 
     @property
     def refuted(self) -> str:
-        """That the ground truth refutes the error bar, in words; empty where it does not."""
+        """Message that the ATE against the ground truth is outside of the error bar; empty if it is not."""
         bar, truth = self.expected_ate_m, self.ground_truth
         if bar is None or truth is None or bar.low <= truth.optimized.ate_rmse_m <= bar.high:
             return ""
@@ -154,7 +154,7 @@ class Metrics(Struct, frozen=True):
 
     @property
     def judged(self) -> Judged:
-        """Verdict, error estimate, reason and stretches to check."""
+        """Verdict, error estimate, reason and segments to check."""
         return Judged(self.verdict, self.verdict_reason, self.stretches, self.verdict_error)
 
     @property
@@ -192,7 +192,7 @@ class Metrics(Struct, frozen=True):
         return f" (and {self.compile_s:.0f} s compiling, once after an installation)"
 
     def write(self, path: Path) -> None:
-        """Write as JSON; what is not finite becomes null."""
+        """Write as JSON; values that are not finite become null."""
         path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
 
@@ -276,13 +276,13 @@ def compare_with_truth(
 
 
 def verdict_lines(headline: str, reasons: Sequence[str]) -> Iterator[str]:
-    """The first lines of a summary: the verdict, and a line each reason, indented."""
+    """The first lines of a summary: the verdict, and one indented line per reason."""
     yield f"{VERDICT:<14} {headline}"
     yield from (f"{REASON}{reason}" for reason in reasons)
 
 
 def shortened(summary: str) -> str:
-    """A summary for a terminal: folded, with the first reasons only, without times by stage."""
+    """A summary for a terminal: lines wrapped, with the first reasons only, without times by stage."""
     lines = [line for line in summary.splitlines() if not line.startswith(_BY_STAGE)]
     reasons = [line for line in lines if line.startswith(REASON)]
     more = [f"{REASON}{len(reasons) - _FIRST:,} more in summary.txt"] if len(reasons) > _FIRST else []
@@ -290,7 +290,7 @@ def shortened(summary: str) -> str:
 
 
 def removed(points: int) -> str:
-    """Points of moving objects that a map does not have, in words; empty for none."""
+    """Number of points of moving objects removed from a map, in words; empty for none."""
     return f"; {counted(points, 'point')} of moving objects removed" if points else ""
 
 
@@ -349,7 +349,7 @@ def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
 
 
 def accuracy_lines(truth: GroundTruth) -> list[str]:
-    """Accuracy as text, a line each."""
+    """Lines of text that state the accuracy."""
     missing = f"; {truth.optimized.missing}" if truth.optimized.missing else ""
     lines = [
         f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, "

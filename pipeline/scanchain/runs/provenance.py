@@ -22,10 +22,10 @@ _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec
 
 
 class LogFile(Struct, frozen=True):
-    """A file or folder that was read; ``sha256`` is empty until it is known.
+    """A file or folder that was read; ``sha256`` is empty until it is computed.
 
-    That of a folder is taken over its files in the order of their names, each as its name and its contents. A
-    remote file, which need not be read whole, has its ETag or the time of its last change as ``version`` instead.
+    The hash of a folder covers the names and contents of its files, sorted by name. A remote file, which is not
+    necessarily read as a whole, has its ETag or modification time as ``version`` instead.
     """
 
     path: str
@@ -35,7 +35,7 @@ class LogFile(Struct, frozen=True):
 
 
 class Provenance(Struct, frozen=True):
-    """Origin of a run directory. ``complete`` is False while it is written and in one marked partial."""
+    """Origin of a run directory. ``complete`` is False while it is written and if it is marked partial."""
 
     complete: bool
     stopped: str
@@ -50,11 +50,11 @@ class Provenance(Struct, frozen=True):
     versions: dict[str, str]
 
     def write(self, path: Path) -> None:
-        """Write as JSON, whole or not at all."""
+        """Write as JSON, atomically."""
         write_whole(path, msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
     def hashed(self, hashing: Hashing) -> Provenance:
-        """With the hashes of its logs, waited for."""
+        """Copy with the hashes of its logs; waits until they are computed."""
         digests = zip(self.logs, hashing.digests(), strict=True)
         return msgspec.structs.replace(
             self, logs=[msgspec.structs.replace(file, sha256=sha256) for file, sha256 in digests]
@@ -86,7 +86,7 @@ def _log_file(source: Source) -> LogFile:
 
 
 class Hashing:
-    """SHA-256 of files, computed in a thread beside the run, which an end of the program does not wait for."""
+    """SHA-256 of files, computed in a daemon thread in parallel to the run."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
         self._sources, self._digests = tuple(sources), list[str]()
@@ -94,7 +94,7 @@ class Hashing:
         self._thread.start()
 
     def digests(self) -> list[str]:
-        """The hashes, in the order of the sources, waited for; those of remote files are empty."""
+        """The hashes, in the order of the sources; empty for remote files. Waits until they are computed."""
         self._thread.join()
         return self._digests
 
@@ -104,7 +104,7 @@ class Hashing:
 
 
 def _sha256_of(path: Path) -> str:
-    """SHA-256 of a file, or of a folder as of a ``LogFile``; empty where it cannot be read."""
+    """SHA-256 of a file, or of a folder as described in ``LogFile``; empty where it cannot be read."""
     digest = hashlib.sha256()
     try:
         for file in files_of(path):
@@ -118,7 +118,7 @@ def _sha256_of(path: Path) -> str:
 
 
 def identity_of(source: Source) -> str:
-    """Hash of the path, of size and last change of each file, remote ones' version; empty where unreadable."""
+    """Hash of path, sizes and modification times, or version of a remote file; empty where unreadable."""
     try:
         if isinstance(source, Path):
             files = [(file, file.stat()) for file in files_of(source.resolve(strict=True))]

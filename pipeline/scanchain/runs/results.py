@@ -47,13 +47,13 @@ from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
-_MOST_SCANS = 20_000  # evenly spread over the log, whose errors are expected
+_MOST_SCANS = 20_000  # maximum number of scans, evenly spread over the log, whose errors are estimated
 _TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground above which it is reported
 
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """The point cloud of the world: points (N, d), meters, and the number left out because they moved."""
+    """The point cloud of the world: points (N, d), meters, and the number of points removed as moving."""
 
     points: Points
     removed: int
@@ -61,10 +61,11 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """Everything known after the last scan of a log: the input of the files of a run directory.
+    """Everything computed from a log, from which the files of a run directory are written.
 
-    ``drawn`` is the cloud as it is drawn in a thread beside, while the files without it are written. The ``grid``
-    is level in space: ``T_world_level`` (4, 4) turns its z axis to that of the world, along the first lidar's.
+    ``drawn`` is the cloud, computed in a background thread while the files that do not need it are written. In 3D
+    the ``grid`` is level: ``T_world_level`` (4, 4) rotates it into the world frame, whose z axis is
+    that of the first lidar pose.
     """
 
     log: Log
@@ -78,7 +79,7 @@ class Results:
 
     @property
     def cloud(self) -> Cloud:
-        """The cloud, waited for."""
+        """The cloud; waits until it is computed."""
         return self.drawn.result()
 
     @property
@@ -94,7 +95,7 @@ class Results:
 
 
 def _write_saved_map(path: Path, results: Results) -> None:
-    """The map of the largest piece of the log."""
+    """Write the saved map, from the largest submap of the log only."""
     result, graph = results.result, results.result.graph
     chosen = np.flatnonzero(result.components == np.bincount(result.components).argmax())
     poses = result.T_world_keyframes
@@ -126,9 +127,9 @@ def results_of(
 def expected_of(
     result: SlamResult, config: Config, scans: Iterable[Scan] | None = None, distorted_share: float = 0.0
 ) -> ExpectedErrors | None:
-    """Expected errors of scans and keyframes; None without an edge, or where these leave poses free.
+    """Expected errors of scans and keyframes; None without edges, or where these do not constrain all poses.
 
-    scans, distorted_share : as in ``systematic_of``; without scans random errors only
+    scans, distorted_share : as in ``systematic_of``; without scans, random errors only
     Raises InputError where the scans cannot be read again.
     """
     if not len(result.graph.edges):
@@ -145,11 +146,11 @@ def expected_of(
 def systematic_of(
     result: SlamResult, config: Config, scans: Iterable[Scan] | None, distorted_share: float
 ) -> tuple[ScanPoses, Influence | None]:
-    """The poses of scans, with what distorts them, and the influence of groups of directions on these.
+    """Poses of scans, with their possible distortion, and the influence of groups of beam directions on them.
 
-    Of all scans of a log, or some that are evenly spread and all keyframes.
-    scans : of the log once more, in order; distorted_share : of the motion between two, by which these may be
-        distorted
+    Of all scans of a log, or, in a long log, of evenly spread scans and all keyframes.
+    scans : of the log, read again, in order; None for no influence and no distortion
+    distorted_share : share of the motion between two scans by which they may be distorted
     """
     keyframes, odometry = np.array([keyframe.scan_index for keyframe in result.keyframes]), result.odometry.poses
     chosen = np.union1d(np.arange(0, len(odometry), math.ceil(len(odometry) / _MOST_SCANS)), keyframes)
@@ -164,7 +165,7 @@ def systematic_of(
 
 
 def _most_uncertain(keyframes: Trajectory, covariances: Matrix) -> str:
-    """The part of the log around the most uncertain position in which all are at least half as uncertain."""
+    """Text on the interval around the most uncertain position, in which all σ are at least half as large."""
     d = keyframes.dimension
     sigma_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
     worst = int(sigma_m.argmax())
@@ -177,13 +178,13 @@ def _most_uncertain(keyframes: Trajectory, covariances: Matrix) -> str:
 
 
 def write_results(folder: Path, results: Results) -> None:
-    """Write every requested output into a run directory; a new format is a writer, and a line here."""
+    """Write every requested output into a run directory; a new format needs a writer and a line here."""
     log, config, result = results.log, results.config, results.result
     trajectory, graph = result.trajectory, result.graph
     write_tum(folder / "trajectory.tum", trajectory)
     write_kitti(folder / "trajectory.kitti.txt", trajectory)
     write_tum(folder / "odometry.tum", result.odometry)
-    if log.mounting.base and log.mounting.motion is None:  # the robot's, in the frame of the lidar's
+    if log.mounting.base and log.mounting.motion is None:  # robot base, in the same world frame
         poses = trajectory.poses @ lie.inverse(log.T_base_lidar)
         write_tum(folder / "trajectory_base.tum", Trajectory(trajectory.stamps_ns, poses))
     write_g2o(folder / GRAPH_FILE, graph)
@@ -238,7 +239,7 @@ def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> It
 
 
 def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
-    """The grid of keyframes at poses (K, d+1, d+1), coarser than configured where that is too large."""
+    """The grid of keyframes at poses (K, d+1, d+1), coarser than configured where it would be too large."""
     resolution_m = fitting_resolution(
         poses, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
     )

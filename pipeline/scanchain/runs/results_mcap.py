@@ -1,4 +1,4 @@
-"""results.mcap: poses and maps as ROS 2 messages, for Foxglove and RViz beside the original log."""
+"""results.mcap: poses and maps as ROS 2 messages, for Foxglove and RViz along with the original log."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _PLANAR = [0, 1, 5]  # x, y, yaw among x, y, z, roll, pitch, yaw
 
 
 def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResult, T_world_grid: Pose) -> None:
-    """Write /tf and /odometry scan by scan, and /path, /map and /map_cloud at the log time of the first.
+    """Write /tf and /odometry per scan, and /path, /map and /map_cloud at the log time of the first scan.
 
-    world → odom is the correction by loop closures, odom → the robot the odometry; the robot's frame is the root
-    of the log's fixed transforms, so that the log's own sensors follow it. The maps are those beside it, the grid
-    in a frame of its own.
+    world → odom is the correction by loop closures, odom → robot the odometry; the robot's frame is the root of
+    the log's fixed transforms, so that the log's own sensors follow it. The maps are read from the files in the
+    same folder; ``T_world_grid`` is the pose of the grid's frame.
     """
     moving = moving_frame(log.indexes, log.publishers.frame, log.mounting, dimension=log.dimension)
     first_ns, first_log_ns = (int(steps.columns[name][0]) for name in ("stamp_ns", "log_time_ns"))
@@ -54,11 +54,11 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
 
 
 def ros_covariance(covariance: Matrix, T: Pose) -> NDArray[np.float64]:
-    """A covariance (6, 6) as in nav_msgs/Odometry: x, y, z, and turns about the fixed axes of its frame.
+    """A covariance (6, 6) as in nav_msgs/Odometry: x, y, z, and rotations about the fixed axes of its frame.
 
     covariance : (k, k) of a twist in the moving frame, T exp(ξ), order (translation, rotation); NaN, where a
-        direction is undetermined, becomes zeros, which stand for unknown
-    T : that frame's pose
+        direction is unobservable, becomes 0, which means unknown
+    T : pose of the moving frame
     """
     spread = np.zeros((6, 6))
     places = _PLANAR if len(covariance) == 3 else list(range(6))
@@ -86,5 +86,5 @@ def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, pose
 
 
 def _rows(points: Points) -> NDArray[np.void]:
-    """Points (N, d) as rows of x, y, z, which is 0 in the plane."""
+    """Points (N, d) as rows of x, y, z; in 2D, z is 0."""
     return lie.lift_points(points).astype("<f4").view([(name, "<f4") for name in "xyz"])[:, 0]

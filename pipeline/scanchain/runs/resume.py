@@ -46,7 +46,7 @@ from scanchain.settings import flatten
 from scanchain.slam import Slam
 from scanchain.trajectory import write_tum
 
-_LEISURE = 20.0  # least time between two checkpoints over the time that one takes to write
+_LEISURE = 20.0  # minimum ratio of the time between two checkpoints to the time to write one
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", CHECKPOINT_FILE, POINTS_FILE)
 _KEY_BYTES = _SIGNATURE_BYTES = 32
@@ -54,10 +54,10 @@ _KEY_BYTES = _SIGNATURE_BYTES = 32
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A run after some scans, which took ``run_s`` seconds of work, in the directory that it left.
+    """State of a stopped run after some scans, which took ``run_s`` seconds of work; ``folder`` is its directory.
 
-    The first ``recorded_bytes`` of the recording hold these scans, none where it was not kept whole; ``process``
-    numbers the processes that wrote to the run directory, from 0.
+    The first ``recorded_bytes`` of the recording contain these scans; 0 if there was no complete recording.
+    ``process`` is the number, from 0, of the process that wrote it, among those that wrote to the run directory.
     """
 
     folder: Path
@@ -72,7 +72,7 @@ class Checkpoints:
     """Writer of checkpoints, at an interval at which they take at most 5 % of the time."""
 
     def __init__(self, folder: Path, every_s: float, left: Checkpoint | None = None) -> None:
-        """Left : the checkpoint of the processes before, whose work counts as this one's."""
+        """``left`` is the checkpoint to resume from, whose time of work is added to that of this process."""
         self.path = folder / CHECKPOINT_FILE
         self.version = _version()
         self.process = 0 if left is None else left.process + 1
@@ -86,13 +86,13 @@ class Checkpoints:
             self.absent = f"no checkpoints, so that --resume would start over: {error.text}"
 
     def are_due(self) -> bool:
-        """True when it is time for the next."""
+        """True when it is time for the next checkpoint."""
         return bool(self.key) and perf_counter() >= self.next_s
 
     def write(self, slam: Slam, steps: StepTable, recorded_bytes: int = 0) -> None:
-        """Write one, whole or not at all: a line on the version, a pickle, the signature of both.
+        """Write a checkpoint atomically: a line with the version, a pickle, and the signature of both.
 
-        Raises OSError on a full disk; the last checkpoint stays. Nothing is written where there is no key.
+        Raises OSError on a full disk; the last checkpoint stays. Nothing is written if there is no key.
         """
         if not self.key:
             return
@@ -108,11 +108,11 @@ class Checkpoints:
 
 
 def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
-    """The last checkpoint of a run. Raises InputError for one that is damaged or that others or other code made.
+    """The last checkpoint of a run. Raises InputError if it is damaged, or by another user or other code.
 
     Nothing is unpickled before its signature is checked, as a pickle may run any code.
 
-    config : of the resuming user, with which it must have been made
+    config : of the resuming run; that of the checkpoint must be equal
     """
     path = folder / CHECKPOINT_FILE
     data = path.read_bytes()
@@ -134,7 +134,7 @@ def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
 
 @cache
 def _version() -> bytes:
-    """Versions, and checksum of the code, as it began: others would not give the same bits, or read the pickle."""
+    """Versions and checksum of the code at start: other code may give other bits or fail to read the pickle."""
     package = Path(__file__).parents[1]
     code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
     on = f"Python {platform.python_version()}, NumPy {np.__version__}"
@@ -147,9 +147,9 @@ def _key_file() -> Path:
 
 
 def _key() -> bytes:
-    """Key of this user, random bytes made at first use, with which checkpoints are signed (HMAC).
+    """Secret key of this user with which checkpoints are signed (HMAC): random bytes, generated at first use.
 
-    Raises InputError where there is none and none can be made, or where it is not this user's alone.
+    Raises InputError if there is none and none can be created, or if other users have access to it.
     """
     remedy = "set XDG_STATE_HOME to a folder of yours"
     try:
@@ -159,12 +159,12 @@ def _key() -> bytes:
             new = path.with_name(f"{path.name}.{secrets.token_hex(8)}")
             with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
                 file.write(secrets.token_bytes(_KEY_BYTES))
-            with suppress(FileExistsError):  # that of another process, which was faster
+            with suppress(FileExistsError):  # another process created it first
                 os.link(new, path)
             new.unlink()
         with path.open("rb") as file:
             status, key = os.fstat(file.fileno()), file.read(_KEY_BYTES + 1)
-    except (OSError, RuntimeError) as error:  # the latter of a user without a home
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home directory
         raise InputError(f"no key to sign them with: {one_line(error)}; {remedy}") from error
     if status.st_mode & 0o077 or status.st_uid != os.geteuid() or len(key) != _KEY_BYTES:
         raise InputError(f"{path}: is not a key of this user alone ({_KEY_BYTES} bytes, mode 600); remove it")
@@ -172,11 +172,11 @@ def _key() -> bytes:
 
 
 class _Pickler(pickle.Pickler):
-    """Leaves out what lies in a file beside it, what runs in a thread, and objects of the user's own classes."""
+    """Leaves out points (in a file of their own), matchers, threads and objects of the user's own classes."""
 
     def __init__(self, file: BinaryIO, config: Config) -> None:
         super().__init__(file, protocol=5)
-        self.own = set(flatten(config).values())  # among them any MODULE:CLASS
+        self.own = set(flatten(config).values())  # including any MODULE:CLASS
 
     def persistent_id(self, value: Any) -> tuple[Any, ...] | None:
         if isinstance(value, PointStore):
@@ -185,12 +185,12 @@ class _Pickler(pickle.Pickler):
             return ("matcher",)
         kind = type(value)
         if isinstance(value, Thread) or f"{kind.__module__}:{kind.__qualname__}" in self.own:
-            return ("nothing",)  # which begins anew where it is missed
+            return ("nothing",)  # None after loading; created again where needed
         return None
 
 
 class _Unpickler(pickle.Unpickler):
-    """Puts in again what was left out."""
+    """Restores points and matchers that were left out, the rest as None."""
 
     def __init__(self, file: BinaryIO, config: Config) -> None:
         super().__init__(file)
@@ -203,14 +203,15 @@ class _Unpickler(pickle.Unpickler):
             self.left_out[pid] = create_matcher(self.config.matching) if what == "matcher" else None
             if what == "points":
                 self.left_out[pid] = store = PointStore(size[0])
-                store.rows, store.crc = size[1:]  # of the file that it is to reopen
+                store.rows, store.crc = size[1:]  # of the file that it will reopen
         return self.left_out[pid]
 
 
 def find_left(out: Path, config: Config) -> Checkpoint | None:
-    """State of an earlier run into ``out``, None if it had no checkpoint.
+    """Checkpoint of an earlier run into ``out``; None if there is none.
 
-    config : that of now. Raises InputError where that run's, or its version, was another, or it still runs.
+    config : of this run
+    Raises InputError if the earlier run had another configuration or version, or still runs.
     """
     folder = left_behind(out)
     if folder is None:
@@ -221,7 +222,7 @@ def find_left(out: Path, config: Config) -> Checkpoint | None:
 
 
 def after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Scan, None, None]:
-    """The scans that follow those already done. Raises InputError where these were not the same."""
+    """The scans after those already processed. Raises InputError if the processed ones differ from the log."""
     names = ("index", "stamp_ns", "log_time_ns", "scan_points", "dropped")
     for index, *known in zip(*(left.steps.columns[name].tolist() for name in names), strict=True):
         scan = next(scans, None)
@@ -233,12 +234,13 @@ def after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Sca
 def set_aside(folder: Path, left: Checkpoint) -> None:
     """Remove files that will be written again, except the recording, which is renamed.
 
-    Its name holds the number of its process: one killed before its own first checkpoint leaves it to the next.
+    The new name contains the number of its process, so that it remains if this process is killed before its own
+    first checkpoint.
     """
     before, recording = _recorded_by(left.process, folder), folder / RECORDING_FILE
     if recording.is_file() and not before.exists():
         recording.rename(before)
-    if left.recorded_bytes:  # of what the process before recorded, too
+    if left.recorded_bytes:  # then it includes what the previous process recorded
         _recorded_by(left.process - 1, folder).unlink(missing_ok=True)
     for path in folder.iterdir():
         if path.name not in _NEEDED and not path.match("recording.part_*.rrd") and not path.is_dir():
@@ -269,7 +271,7 @@ def _recorded_by(process: int, folder: Path) -> Path:
 
 
 def how_to_resume(command: Sequence[str]) -> str:
-    """Command that resumes the run which this command line started; scripts have none."""
+    """Text on how to resume the run that this command line started; without a command for scripts."""
     words = [*without_keys(command[1:]), *([] if "--resume" in command else ["--resume"])]
     again = f"scanchain {shlex.join(words)}" if len(command) > 1 else "the same with --resume"
     return f"to resume: {again}"
@@ -308,7 +310,7 @@ def _keep(bug: BaseException | None, folder: Path, steps: StepTable) -> None:
     try:
         if bug is not None:
             trace.write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
-        if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
+        if len(steps) and not (folder / "metrics.json").exists():  # else the final results are already written
             write_tum(odometry, steps.trajectory("T_odom_lidar"), force=True)
             steps.write(table, steps.trajectory("T_world_lidar"))
     except OSError:

@@ -1,4 +1,4 @@
-"""A run: a log in, a run directory out."""
+"""A run: processes a log and writes a run directory."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ from scanchain.threads import threads
 from scanchain.trajectory import write_tum, write_wide_tum
 from scanchain.verdict import Judged, judge
 
-_FEW_SCANS = 2  # scans whose trajectory shows at most one motion
-TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
+_FEW_SCANS = 2  # number of scans up to which a trajectory has at most one motion
+TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # at these scan stamps; may raise InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +76,10 @@ class Finished:
 def run(
     job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None] = lambda folder: None
 ) -> Finished:
-    """Open the log, process it, write the run directory, to which ``report`` adds its page in the end.
+    """Open the log, process it, write the run directory; at the end, ``report`` adds its page to this.
 
-    Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met, and
-    OwnCodeError where code of the user's own fails, which leaves nothing.
+    Raises InputError for bad input; no new directory remains unless scans were processed before. Raises
+    OwnCodeError where the user's own code fails; no new directory remains.
     """
     this = _Run(job, progress)
     with this.directory, announcing_compilation(progress.say):
@@ -101,12 +101,12 @@ def run(
 
 
 class _Run:
-    """A log on its way into a run directory: begun or resumed, processed scan by scan, written, judged."""
+    """The steps of a run: begin or resume, process every scan, write the results, measure and complete."""
 
     def __init__(self, job: Job, progress: Progress) -> None:
-        """Open the log, and what a stopped run left. Raises InputError where either does not fit the job."""
+        """Open the log and a stopped run's checkpoint. Raises InputError where either does not fit the job."""
         self.began_s, self.compiled_before_s = working_s(), compiled_s()
-        self.hashing = Hashing(job.logs)  # from the beginning on: while the log is opened a core is idle
+        self.hashing = Hashing(job.logs)  # started first: a core is idle while the log is opened
         self.job, self.progress = job, progress
         self.log, settings, truth_file = opened(job)
         self.true_poses = partial(true_poses, self.log, truth_file, progress)
@@ -135,7 +135,7 @@ class _Run:
             progress.announce(f"{job.out}: no checkpoint to resume from, this run starts at the first scan")
 
     def begin(self) -> tuple[Slam, Generator[Scan, None, None]]:
-        """SLAM, new or as of the checkpoint, and the scans that follow; the directory states what is run in it."""
+        """SLAM, new or from the checkpoint, and the scans that follow; writes run.json and the configuration."""
         folder, left = self.directory.path, self.left
         self.provenance.write(folder / RUN_FILE)
         write_whole(folder / "config.toml", dump(self.config).encode())
@@ -159,13 +159,13 @@ class _Run:
         )
 
     def process(self, slam: Slam, scans: Generator[Scan, None, None], recording: Recorder) -> SlamResult:
-        """Place every scan, from the first on or from the checkpoint."""
+        """SLAM result of all scans, processed from the first one or from the checkpoint on."""
         checkpoints = self.checkpoints
         if recording.web_address:
             self.progress.announce(f"viewer: {recording.web_address}")
         if self.left is not None:
             self.resumed = [resume_recording(self.directory.path, self.left, recording, checkpoints)]
-        with closing(scans):  # what it left out is counted then, also if the run was stopped
+        with closing(scans):  # counts what the log left out, also if the run was stopped
             tracked = self.progress.track(scans, self.log.scan_count)
             if slam.dimension == 3 and threads() > 1:
                 tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
@@ -179,7 +179,7 @@ class _Run:
         return slam.finish(self.progress.say)
 
     def write(self, result: SlamResult, recording: Recorder) -> tuple[Results, ExpectedErrors | None, Judged]:
-        """Write the results to the directory, and the verdict on them and on the truth to the recording."""
+        """Write the results to the directory, and them, the verdict and the ground truth to the recording."""
         self.progress.say("building the maps and writing the results")
         with self.directory.results() as folder:
             final = final_verdicts(result.closures, result.state)
@@ -192,7 +192,7 @@ class _Run:
             judged = judge(evidence, result.T_base_lidar, self.log.distortion)
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
-            with suppress(InputError):  # which is reported with the accuracy
+            with suppress(InputError):  # reported with the accuracy
                 reference = self.true_poses(result.trajectory.stamps_ns)
                 if reference is not None:
                     moved = on_the_estimate(result.trajectory, reference, gap_s=self.job.max_gap_s)
@@ -200,7 +200,7 @@ class _Run:
         return results, expected, judged
 
     def expected(self, result: SlamResult) -> ExpectedErrors | None:
-        """Expected errors, with the systematic ones by odometry of scans that are read once more."""
+        """Expected errors; the systematic ones are measured by odometry on the scans, which are read again."""
         if self.config.outputs.error_bars == "full" and not self.progress.stopped:
             self.progress.say(
                 "measuring systematic errors: odometry without one group of directions after the other"
@@ -214,7 +214,7 @@ class _Run:
         return expected_of(result, self.config)
 
     def hold(self, recording: Recorder) -> float:
-        """Keep the web viewer open, which lives as long as the recording; seconds until the user ended this."""
+        """Keep the web viewer, which ends with the recording, open until the user stops it; seconds waited."""
         began_s = perf_counter()
         if recording.web_address:
             self.progress.announce(f"done; the viewer at {recording.web_address} stays until Ctrl-C")
@@ -227,7 +227,7 @@ class _Run:
         self, results: Results, expected: ExpectedErrors | None, judged: Judged, of_recording: Sequence[str],
         held_s: float,
     ) -> tuple[Metrics, str]:  # fmt: skip
-        """Measure the run, and write the figures; these and the summary."""
+        """Metrics and summary of the run, which are also written to the directory."""
         log, result = self.log, results.result
         run_s, compile_s = working_s() - self.began_s - held_s, compiled_s() - self.compiled_before_s
         stopped = f"stopped by the user after {counted(len(self.steps), 'scan')}" if self.progress.stopped else ""
@@ -273,7 +273,7 @@ class _Run:
 def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     """The log of a job, the settings for it, and the ground truth if a file is named.
 
-    Raises InputError for what does not fit together, before anything is processed.
+    Raises InputError where these do not fit together, before anything is processed.
     """
     for source, count in Counter(source.resolve() for source in job.logs).items():
         if count > 1:
@@ -310,7 +310,7 @@ def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
 def true_poses(
     log: Log, file: TruthFile | None, progress: Progress, stamps_ns: NDArray[np.int64]
 ) -> Trajectory | None:
-    """Poses of the file named, else the log's own; of a KITTI file those of the scans (N,) read before a stop."""
+    """True poses of the named file, else of the log; of a KITTI file, those of the scans (N,) before a stop."""
     if file is None:
         return log.ground_truth()
     return (file.first(len(stamps_ns)) if progress.stopped else file).at(stamps_ns)
@@ -319,7 +319,7 @@ def true_poses(
 def accuracy_of(
     poses: TruePoses, source: str, gap_s: float | None, result: SlamResult, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
-    """Accuracy where there is a truth; warnings where it does not fit, is of few scans, or far off."""
+    """Accuracy if there is ground truth; warnings if it does not fit or has few scans, or the error is large."""
     try:
         reference = poses(result.odometry.stamps_ns)
         if reference is None:

@@ -1,4 +1,4 @@
-"""steps.parquet: one row a scan, and the NEES of its covariances."""
+"""steps.parquet: one row per scan, and the NEES of its covariances."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from scanchain.verdict import check_overlap, check_velocity, check_wheels
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix below which it is not inverted
+_SINGULAR = 1e-12  # ratio of smallest to largest eigenvalue below which an information matrix is not inverted
 
 
 class StepTable:
-    """Figures of all steps in columns, without their points: a step takes microseconds, and under a kilobyte."""
+    """Figures of all steps in columns, without points: adding a step takes microseconds and under a kilobyte."""
 
     def __init__(self) -> None:
         self.columns = Columns()
@@ -32,7 +32,7 @@ class StepTable:
         return len(self.columns)
 
     def append(self, step: Step) -> None:
-        """Keep one step."""
+        """Add one step."""
         scan, match = step.scan, step.match
         unknown = np.full_like(step.T_odom_lidar, np.nan)
         self.columns.append({
@@ -53,7 +53,7 @@ class StepTable:
         return State(self.columns.texts[self.columns["state"][-1]])
 
     def trajectory(self, name: str) -> Trajectory:
-        """The steps so far by ``T_odom_lidar``, or by ``T_world_lidar``, each as it was known at its time."""
+        """Trajectory of the steps so far, ``T_odom_lidar`` or ``T_world_lidar``, as estimated at each step."""
         return Trajectory(self.columns["stamp_ns"].copy(), self.columns[name].copy())
 
     @property
@@ -77,7 +77,7 @@ class StepTable:
         return Counter(State(names[code]) for code in self.columns["state"].tolist())
 
     def write(self, path: Path, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> None:
-        """Write the table; ``trajectory`` has the final pose of each step, ``T_base_lidar`` is for the wheels."""
+        """Write the table; ``trajectory`` has the final poses, ``T_base_lidar`` converts the wheel poses."""
         import pyarrow.parquet as pq
 
         pq.write_table(self.table(trajectory, T_base_lidar), path, compression="zstd", write_page_checksum=True)
@@ -113,7 +113,7 @@ class StepTable:
         return pa.table(arrays)
 
     def _checks(self, steps: Columns, trajectory: Trajectory, T_base_lidar: Pose | None) -> dict[str, object]:
-        """Poses by the wheels, and normalized innovations of the independent checks, null where there are none."""
+        """Lidar poses by the wheels, and normalized innovations of the independent checks; null where unknown."""
         import pyarrow as pa
 
         velocity = check_velocity(trajectory.stamps_ns, steps["log_time_ns"].copy(), trajectory.poses)
@@ -153,7 +153,7 @@ STAGES = ("read", "preprocess", "match", "map", "loops")
 
 
 def _lists(rows: Matrix, is_null: NDArray[np.bool_] | None = None) -> pa.FixedSizeListArray:
-    """Rows (N, ...) as lists of one length, null where so marked (N,)."""
+    """Rows (N, ...) as lists of fixed size, null where ``is_null`` (N,)."""
     import pyarrow as pa
 
     size = int(np.prod(rows.shape[1:]))
@@ -175,9 +175,9 @@ COLUMNS = ("covariance", "state")
 def nees_of_steps(
     steps: pa.Table, odometry: Trajectory, truth: Trajectory, *, gap_s: float | None = None
 ) -> NDArray[np.float64]:
-    """(N,) NEES of the motion up to each scan; NaN without a true pose at both ends, or where a scan was not ok.
+    """(N,) NEES of the motion to each scan; NaN without a true pose at both ends, or where a scan was not ok.
 
-    steps : with ``COLUMNS``, a row a scan; odometry : T_odom_lidar of the same scans, SE(2) or lifted
+    steps : with ``COLUMNS``, one row per scan; odometry : T_odom_lidar of the same scans, SE(2) or lifted
     """
     size = steps.schema.field("covariance").type.list_size
     unknown, k = [np.nan] * size, math.isqrt(size)

@@ -1,4 +1,4 @@
-"""The verdict on a run, from its tables, and on a trajectory of another tool, from the log that it was made of."""
+"""Verdict on a run, from its tables, and on the trajectory of another tool, from the log it was computed from."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from scanchain.verdict import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_FEWEST = 3  # scans with a pose
+_FEWEST = 3  # minimum number of scans with a pose
 
 
 class Known(msgspec.Struct):
@@ -59,7 +59,7 @@ def judge_run(folder: Path) -> Judged:
         return judge(evidence_of_run(folder, known.expected_ate_m), distortion=known.distortion)
     except InputError:
         raise
-    except Exception as error:  # whatever damaged figures make NumPy raise
+    except Exception as error:  # any that NumPy raises on damaged figures
         raise InputError(f"{folder}: its tables are damaged ({one_line(error)}); run the log again") from error
 
 
@@ -84,7 +84,7 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
         if (folder / name).exists():
             closures = pq.ParquetFile(folder / name, page_checksum_verification=True).read()
         return evidence_of(steps, closures, expected)
-    except Exception as error:  # whatever a damaged file, or one of another make, makes Arrow and NumPy raise
+    except Exception as error:  # any that Arrow or NumPy raises on a damaged or foreign file
         remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
         why = "" if isinstance(error, FileNotFoundError) else f" ({one_line(error)})"
         raise InputError(f"{folder}: has no {name} that can be read{why}; {remedy}") from error
@@ -129,7 +129,8 @@ def evidence_of_trajectory(
 ) -> Evidence:
     """Evidence of a trajectory without matches: wheels (N, d+1, d+1), NaN where unknown, at the same scans.
 
-    bounds_m : on its error, by the name of another estimate of the same motion; the wheels are one as well
+    bounds_m : upper bounds on its error, by the name of the other estimate of the same motion that they come
+        from; that from the wheels is added where these are known
     """
     n, unknown = len(trajectory), np.zeros(len(trajectory), np.bool_)
     found = Evidence(
@@ -156,7 +157,7 @@ def evidence_of_trajectory(
 
 
 def _open_m(residuals_m: NDArray[np.float64], inliers: NDArray[np.int64], dimension: int) -> float:
-    """Twice the standard deviation of a pose by its residuals, each of which constrains one of d directions."""
+    """Twice the median standard deviation of a position by its residuals, each along one of d directions."""
     sigmas_m = residuals_m / np.sqrt(np.maximum(inliers, 1) / dimension)
     known_m = sigmas_m[np.isfinite(sigmas_m)]
     return 2.0 * float(np.median(known_m)) if len(known_m) else 0.0
@@ -182,7 +183,7 @@ def _no_closures(poses: Matrix) -> Closures:
 
 
 def poses_of(table: pa.Table, prefix: str = "", dimension: int = 3) -> Matrix:
-    """(N, d+1, d+1) of the columns whose names begin so, NaN where one is null."""
+    """Poses (N, d+1, d+1) from the columns whose names begin with ``prefix``, NaN where one is null."""
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     values = np.stack(
         [table[f"{prefix}{name}"].to_numpy(zero_copy_only=False).astype(np.float64) for name in names], axis=1
@@ -199,7 +200,8 @@ def poses_of(table: pa.Table, prefix: str = "", dimension: int = 3) -> Matrix:
 def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Override]) -> tuple[Judged, int]:
     """The verdict on the poses at the scans of a log, and the number of scans without a pose.
 
-    Checked are wheels, constant velocity, and each scan aligned to a map of those before at the given poses.
+    Checks: wheel odometry, constant velocity, and alignment of each scan to a map of the scans before it at the
+    given poses.
     file : TUM, poses of the lidar. Raises InputError where it has poses for fewer than three scans.
     """
     poses = read_tum(file)
@@ -230,7 +232,7 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
 
 
 def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Matrix]:
-    """Stamps, log times, numbers of points and poses of the lidar by the wheels, NaN where unknown."""
+    """Stamps, log times, numbers of points, and lidar poses by the wheels, NaN where unknown, of all scans."""
     rows, wheels = [], []
     unknown = np.full(log.T_base_lidar.shape, np.nan)
     for scan in log.scans(config.preprocess):
@@ -241,10 +243,10 @@ def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def _matched_bound_m(poses: Matrix, corrections: Matrix) -> float:
-    """Difference of a trajectory from the one that goes on from each pose as the next scan is matched.
+    """RMS distance of a trajectory from the one chained from its motions as corrected by scan matching.
 
-    A scan is matched to a map at the given poses. An error that grows along the path shows in every correction, so
-    that their sum is larger than it.
+    Each scan is matched to a map at the given poses. An error that grows along the path shows in every correction,
+    so that the sum of the corrections is larger than the error.
     """
     motions = lie.between(poses[:-1], poses[1:]) @ corrections[1:]
     chained = [poses[0]]
@@ -254,9 +256,9 @@ def _matched_bound_m(poses: Matrix, corrections: Matrix) -> float:
 
 
 def _matched(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> tuple[Matrix, Matrix]:
-    """Each scan aligned from its given pose to a map of those before: the corrections (N, d+1, d+1) by it.
+    """Corrections (N, d+1, d+1) of given poses by aligning each scan to a map of the scans before it.
 
-    With them, (3, N), share of inliers, observability and fit, which is 0 where the match ended elsewhere.
+    Also (3, N): inlier share, observability and fit, which is 0 where a match is too far from the given pose.
     """
     resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
     keeper, matcher = MapKeeper(trajectory.dimension, config.local_map), create_matcher(config.matching)

@@ -1,6 +1,6 @@
 """Independent checks of a trajectory: normalized innovations against wheel odometry and constant velocity.
 
-What they and the other evidence find are stretches of scans.
+Their findings, like those of all other evidence, are segments of consecutive scans: ``Stretch``.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 Floats = NDArray[np.float64]
 
-WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are no finding, standard deviations
+WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are accepted, standard deviations
 WINDOW_M = 4.0  # path over which wheels and trajectory are compared
 _SHORTEST_M = 0.5  # shortest path of a window that is checked
-_LARGEST_CORRECTION = 0.1  # m/m and rad/m: a larger one is no calibration of the wheels
-_RIDGE = 1e-3  # of the calibration's normal equations, against directions in which the wheels never moved
-_ROUNDS = 10  # of the robust regression
-_TURN_M_RAD = 0.5  # path of a turn on the spot
-_LEAST_M, _LEAST_RAD = 0.05, 0.03  # smallest σ of wheels
-_LEAST_SHARE, _MOST_SHARE = 0.02, 0.05  # m/m and rad/m: limits of the learned σ; worse wheels check nothing finer
-_TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals from which σ is learned, and where a normal has it
+_LARGEST_CORRECTION = 0.1  # m/m and rad/m: limit of the correction by the calibration of the wheels
+_RIDGE = 1e-3  # regularization of the calibration, for directions in which the wheels never moved
+_ROUNDS = 10  # iterations of the robust regression
+_TURN_M_RAD = 0.5  # path length per rad of rotation
+_LEAST_M, _LEAST_RAD = 0.05, 0.03  # smallest σ of the wheels over a window
+_LEAST_SHARE, _MOST_SHARE = 0.02, 0.05  # m/m and rad/m: limits of the learned σ of the wheels
+_TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals that gives σ, and its value for a standard normal
 
-_LEAST_TURN_RAD = 1.0  # turns of the wheels over a log, below which their sense is not compared
-_GRID_M, _MEDIAN = 0.1, 21  # of the medians along the path: spacing and number of values
+_LEAST_TURN_RAD = 1.0  # rotation of the wheels over a log below which its direction is not compared
+_GRID_M, _MEDIAN = 0.1, 21  # median filter along the path: spacing and number of samples
 
-_SPUN_M = 0.5  # of path that wheels alone make in a scan, at most: of more they slip, or a reading is wrong
-_WILD = 2.0  # m/m and rad/m by which wheels are wrong in a window, above which it calibrates nothing
+_SPUN_M = 0.5  # largest path per scan counted from the wheels alone: a longer one is slip or a wrong reading
+_WILD = 2.0  # m/m and rad/m: errors of the wheels above which a window is left out of the calibration
 
-_ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands can do
-_MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of a motion between scans by matching
-_ALIKE = 1.4  # an interval shorter than the usual one by this factor is none: its stamps jitter
+_ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands reach
+_MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of the motion between two scans by scan matching
+_ALIKE = 1.4  # largest ratio of the usual interval to one that is used; shorter ones are due to jittering stamps
 
-_SMALL_RAD = 0.1  # difference of headings that is not worth a word
-_FEWEST, _BEFORE = 3, 10  # scans whose median overlap with the map is usual
+_SMALL_RAD = 0.1  # difference of headings below which the text leaves it out
+_FEWEST, _BEFORE = 3, 10  # least and largest number of previous scans whose median is the usual share
 _LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
 
 
 class Kind(StrEnum):
-    """Finding of a stretch."""
+    """Kind of a finding."""
 
     DEGENERATE = "degenerate"
     LOST = "lost"
@@ -68,8 +68,8 @@ class Stretch(Struct, frozen=True):
     """Consecutive suspicious scans.
 
     first, last : scans, from 0; start_s, end_s : since the first scan of the run
-    scans : of this kind among them
-    size_m, size_rad : the contradiction; null where it is not measured
+    scans : number of scans among them that have this finding
+    size_m, size_rad : size of the contradiction; None where not measured
     """
 
     kind: Kind
@@ -83,7 +83,7 @@ class Stretch(Struct, frozen=True):
 
     @property
     def text(self) -> str:
-        """The stretch in words."""
+        """The finding in words."""
         size, turn_rad = "" if self.size_m is None else f" by {self.size_m:,.1f} m", self.size_rad or 0.0
         if self.kind is Kind.ACCELERATION:
             size = f",{size.removeprefix(' by')} from where constant velocity leads"
@@ -96,20 +96,20 @@ class Stretch(Struct, frozen=True):
 
     @property
     def times(self) -> str:
-        """Its seconds as text, one where both ends are the same to a digit."""
+        """Start and end as text, or a single time where both round to the same."""
         start, end = f"{self.start_s:.1f}", f"{self.end_s:.1f}"
         return f"{start if start == end else f'{start} to {end}'} s"
 
 
 class WheelCheck(NamedTuple):
-    """Trajectory against wheels around each scan, NaN where there is nothing to compare.
+    """Differences of trajectory and wheel odometry around each scan, NaN where not comparable.
 
     innovation : (N,) standard deviations
     apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
     poses : (N, d+1, d+1) of the lidar by the wheels, NaN where unknown
-    turn_ratio : turns of the trajectory over those of the wheels; NaN where these turn too little to say
-    known_share : share of the scans whose motion the wheels know, at rest too
-    mounting : of the lidar as motions of wheels and lidar show it, where it clearly is another than was taken
+    turn_ratio : rotation of the trajectory over that of the wheels; NaN where the wheels turn too little
+    known_share : share of the scans with a pose by the wheels, including those at rest
+    mounting : correction of the assumed mounting, estimated from the motions; None unless it is clearly wrong
     """
 
     innovation: Floats
@@ -122,13 +122,13 @@ class WheelCheck(NamedTuple):
 
 
 def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
-    """Motions of a trajectory (N, d+1, d+1) against those by the wheels, NaN where unknown.
+    """Check of the motions of a trajectory (N, d+1, d+1) against wheel odometry, NaN where unknown.
 
-    The differences of the motions are summed up in the lidar's frame, so that neither drift of heading nor slopes
-    matter, and compared before and after each scan, as medians along the path, so that readings that are late or
-    out of time do not matter either. Scale errors, drift and a turned or displaced lidar are calibrated by robust
-    regression over the log; the standard deviations of what is left are learned from the log. A mounting that is
-    far from the one taken is corrected first.
+    The differences of the motions are accumulated in the frame of the lidar, which removes the effects of heading
+    drift and slopes, median-filtered along the path, which removes those of late or irregular readings, and
+    compared over a window around each scan. Scale errors, drift and a rotated or displaced lidar are calibrated by
+    robust regression over the log; the standard deviations of the residuals are learned from the log. An assumed
+    mounting that is clearly wrong is corrected first.
     """
     if (mounting := _mounting(poses, wheel_poses)) is not None:
         wheel_poses = wheel_poses @ mounting.T_base_lidar
@@ -147,7 +147,7 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     path_m = np.cumsum(single_m)
     first = np.searchsorted(path_m, path_m - 0.5 * WINDOW_M, side="left")
     last = np.searchsorted(path_m, path_m + 0.5 * WINDOW_M, side="right") - 1
-    each = np.arange(n)  # with the motions to and from it, however long
+    each = np.arange(n)  # the window includes the motions to and from the scan, however long
     first, last = np.maximum(np.minimum(first, each - 1), 0), np.minimum(np.maximum(last, each + 1), n - 1)
     length_m, unknown = path_m[last] - path_m[first], np.cumsum(~known)
     checked = np.flatnonzero((length_m >= _SHORTEST_M) & (unknown[last] == unknown[first]) & known)
@@ -175,7 +175,7 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
 
 
 def _mounting(poses: Matrix, wheel_poses: Matrix) -> HandEye | None:
-    """The mounting by the motions over pieces of the path, where it clearly is another than was taken."""
+    """Correction of the assumed mounting, from motions over short parts of the path; None unless clearly wrong."""
     pieces = np.floor(np.cumsum(hand_eye.path_m(lie.between(poses[:-1], poses[1:]))) / hand_eye.PAIR_M)
     nodes = np.flatnonzero(np.diff(pieces, prepend=-1.0))
     motions = np.stack([lie.between(each[nodes[:-1]], each[nodes[1:]]) for each in (wheel_poses, poses)])
@@ -186,10 +186,11 @@ def _mounting(poses: Matrix, wheel_poses: Matrix) -> HandEye | None:
 
 
 def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64], poses: Matrix) -> Floats:
-    """(N,) change of the motion to each scan against what an acceleration can be, in standard deviations.
+    """(N,) innovation of each motion against constant velocity, in standard deviations of plausible accelerations.
 
-    The motion before is stretched by the time that passed, by the stamps, by the log or as usual, whichever agrees
-    best: stamps that jitter accelerate nothing. NaN for the first two scans, and where neither clock goes on.
+    The previous motion is scaled by the ratio of the time intervals, by the stamps, by the log times or constant,
+    whichever agrees best, so that jittering stamps cause no innovation. NaN for the first two scans,
+    and for all where neither clock advances.
     """
     n, d = len(poses), poses.shape[-1] - 1
     innovation = np.full(n, np.nan)
@@ -215,7 +216,7 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
 
 
 def smallest_jump_m(seconds: Floats) -> float:
-    """Smallest jump of a position that ``check_velocity`` finds at the usual interval of times (N,)."""
+    """Smallest jump of a position that ``check_velocity`` detects at the median interval of times (N,)."""
     return VELOCITY_LIMIT * float(_sigma_m(np.median(np.diff(seconds)) ** 2)) if len(seconds) > 1 else np.inf
 
 
@@ -224,31 +225,31 @@ def _sigma_m(span_s2: Floats | float) -> Floats:
 
 
 def check_overlap(inlier_share: Floats) -> Floats:
-    """(N,) share of the points with a correspondence over its median in the scans before, NaN for the first.
+    """(N,) inlier share of each scan relative to its median over the previous scans, NaN for the first ones.
 
-    What the lidar saw before it sees again, from nearby: where much of it is gone at once, the lidar is elsewhere
-    than the map says, or something stands close before it.
+    Consecutive scans see mostly the same surfaces. If many correspondences are lost at once, the pose in the map
+    is wrong, or a close object blocks the view.
     """
     usual = np.full(len(inlier_share), np.nan)
-    padded = np.append(np.full(_BEFORE, np.nan), inlier_share)  # the first scans have fewer before them
+    padded = np.append(np.full(_BEFORE, np.nan), inlier_share)  # the first scans have fewer previous ones
     usual[_FEWEST:] = np.nanmedian(sliding_window_view(padded, _BEFORE)[_FEWEST:-1], axis=1)
     return inlier_share / np.maximum(usual, _LEAST_USUAL)
 
 
 def apart_m(positions: Floats, others: Floats) -> float:
-    """Root mean squared distance of positions (N, d) after rigid alignment, as of an ATE."""
+    """Root mean squared distance of positions (N, d) after rigid alignment, as in the ATE."""
     weights = np.ones(len(positions))
     try:
         moved = lie.transform(rigid_transform(positions, others, weights), positions)
-    except DegeneratePairsError:  # on a line, about which a rotation is free
+    except DegeneratePairsError:  # collinear positions: the rotation about their line is undetermined
         moved = positions - positions.mean(axis=0) + others.mean(axis=0)
     return float(np.sqrt(((moved - others) ** 2).sum(axis=1).mean()))
 
 
 def wheel_bound_m(poses: Matrix, wheels: Matrix) -> float:
-    """Difference of a trajectory (N, d+1, d+1) from the wheels, NaN where unknown, seen from above.
+    """Upper bound of the ATE of a trajectory (N, d+1, d+1) by wheel poses, NaN where unknown, in the x-y plane.
 
-    Two estimates whose errors are independent differ by more than either errs, so that this bounds its error.
+    Two estimates with independent errors differ by more than the error of either.
     """
     known = np.flatnonzero(np.isfinite(wheels[:, 0, 0]))
     level = wheels[known[0]] @ lie.between(poses[known[0]], poses[known])  # in the frame of the wheels
@@ -256,7 +257,7 @@ def wheel_bound_m(poses: Matrix, wheels: Matrix) -> float:
 
 
 def _turn_ratio(matched: Matrix, wheels: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> float:
-    """Turns (N, k) of the trajectory along those of the wheels, over these; NaN where the wheels turn little."""
+    """Rotations (N, k) of the trajectory along those of the wheels, as a ratio; NaN where these are small."""
     if _lengths(wheels).sum() < _LEAST_TURN_RAD:
         return np.nan
     matched, wheels = _over(matched, first, last), _over(wheels, first, last)
@@ -265,13 +266,13 @@ def _turn_ratio(matched: Matrix, wheels: Matrix, first: NDArray[np.intp], last: 
 
 
 def _over(motions: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> Matrix:
-    """Sums of motions (N, k) after each first to each last scan."""
+    """Sums of the motions (N, k) between each first and last scan."""
     total = np.cumsum(motions, axis=0)
     return total[last] - total[first]
 
 
 def _smoothed(values: Matrix, path_m: Floats) -> Matrix:
-    """Medians of values (N, d) along the path."""
+    """Values (N, d), median-filtered along the path."""
     grid_m = np.arange(0.0, path_m[-1] + _GRID_M, _GRID_M)
     sampled = [np.interp(grid_m, path_m, each) for each in values.T]
     smooth = [median_filter(each, _MEDIAN, mode="nearest") for each in sampled]

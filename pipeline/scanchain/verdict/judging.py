@@ -17,18 +17,18 @@ from scanchain.verdict.checks import WINDOW_M, Kind, Stretch
 from scanchain.verdict.stretches import KNOWN, Evidence, find_stretches
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
-_MOST_PREDICTED = 0.5  # largest share of scans whose pose is predicted and confirmed by nothing
-_LARGE_M = 1.0  # impossible change of the motion above which the trajectory is wrong
-_EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confirm
-_FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
+_MOST_PREDICTED = 0.5  # largest share of scans with a predicted pose that nothing confirms
+_LARGE_M = 1.0  # jump by an impossible acceleration above which the trajectory is wrong
+_EXPLAINED = 0.5  # least share of a contradiction by loop closures that the wheels must confirm
+_FEW_POINTS = 100  # number of points below which a scan is sparse; scans of planar lidars have more
 _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
 _MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
 _MEDIAN_LIMIT = 2.0  # largest median innovation of the wheels; about 1 where their calibration and σ are right
-_REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # extent and speed of a trajectory, up to which it is one of rest
-_MOST_OPEN_AT_REST = 0.05  # largest share of scans that leave a direction open, of those that show a rest
-_FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # scans that must try loop closures, and least share of closures accepted
-_OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
-_SHOWN = 3  # stretches that the sentence lists
+_REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # largest extent, rotation and mean speed at rest
+_MOST_OPEN_AT_REST = 0.05  # largest share of unconstrained or contradicted scans from which a rest is concluded
+_FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # least number of scans that tried closures; closures accepted per scan
+_OPPOSED = -0.5  # ratio of the rotations of trajectory and wheels below which one of the two is mirrored
+_SHOWN = 3  # number of segments that a reason lists
 _MORE = re.compile(r"and [\d,]+ more")
 _WORKABLE, _WORKABLE_M = 0.03, 0.1  # largest upper bound of the error: share of the trajectory's extent, or meters
 
@@ -49,7 +49,7 @@ class Verdict(StrEnum):
 class Judged:
     """A verdict, its reasons in words, the suspicious segments, and the error estimate.
 
-    error, bound_m : in words, and its upper bound; infinite where that is unknown
+    error, bound_m : the estimate in words, and the upper bound of the error; infinite where unknown
     """
 
     verdict: Verdict
@@ -60,7 +60,7 @@ class Judged:
 
     @property
     def vouched(self) -> str:
-        """The error estimate as far as it is valid: outside of the segments to check, or not at all."""
+        """The error estimate where it is valid: outside of the segments to check; empty if not trustworthy."""
         words = {Verdict.TRUSTWORTHY: "", Verdict.CHECK: "otherwise "}
         return f"{words[self.verdict]}{self.error}" if self.error and self.verdict in words else ""
 
@@ -71,25 +71,28 @@ class Judged:
 
     @property
     def reasons(self) -> list[str]:
-        """The reasons, and all stretches, one by one."""
+        """The single reasons, followed by all suspicious segments not among them."""
         said = [each for each in self.reason.split("; ") if not _MORE.fullmatch(each)]
         return [*said, *(each.text for each in self.stretches if each.text not in said)]
 
     @property
     def sentence(self) -> str:
-        """Verdict, error and reasons, of many stretches the largest."""
+        """Verdict, error and reasons; of many segments, only the largest."""
         return f"{self.headline}: {self.reason}"
 
 
 def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str = "") -> Judged:
-    """The verdict on a trajectory; the log states the mounting ``T_base_lidar``, scans have this ``distortion``.
+    """The verdict on a trajectory, with reasons.
 
-    Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
-    impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
-    contradict at the same place by about the same distance. To be checked is any with a suspicious stretch, and
-    one that is suspicious as a whole: nothing shows whether it moves, wheels disagree all along, many scans are
-    degenerate, or revisited places do not look as mapped. Wheels that slipped, as scans and closures or the wheels
-    themselves show, are named and count for nothing.
+    A trajectory is not trustworthy if most poses are predicted, many scans are contradicted, the acceleration is
+    impossible, wheels contradict it where it is badly measured, or loop closures and wheels contradict it over the
+    same segment by about the same distance. It is to be checked if any segment is suspicious, or the whole is:
+    motion is indistinguishable from rest, wheels disagree throughout or turn opposite, the error is unbounded or
+    large, many scans are degenerate, few closures are accepted, or scans are distorted. Segments where only the
+    wheels slipped are reported, but do not affect the verdict.
+
+    T_base_lidar : mounting stated by the log; None if none is
+    distortion : motion distortion of the scans in words; empty for none
     """
     found = find_stretches(evidence)
     stretches = tuple(each for each in found if each.kind is not Kind.WHEELS_SLIP)
@@ -198,7 +201,7 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
 
 
 def _unbounded(evidence: Evidence, rest: _Rest) -> Iterator[str]:
-    """That the error is unknown, or may be too large for the size of the trajectory."""
+    """Reason if the error is unknown, or may be too large for the extent of the trajectory."""
     limit_m = max(_WORKABLE * rest.extent_m, _WORKABLE_M)
     if rest.is_shown or evidence.bound_m <= limit_m:
         return
@@ -211,10 +214,10 @@ def _unbounded(evidence: Evidence, rest: _Rest) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """Rest of a trajectory that stays where it began, and whether that of the lidar is shown.
+    """Whether a trajectory stays at its first pose, and whether this shows that the lidar was at rest.
 
-    Scans that constrain every direction show it, as do wheels. Along a direction that they leave open, a lidar in
-    motion sees the same as one at rest.
+    Scans that constrain every direction show it, and so do wheels. Along an unconstrained direction, the scans of
+    a moving lidar are the same as those of one at rest.
     """
 
     is_there: bool
@@ -249,7 +252,7 @@ def _extent_m(poses: Matrix) -> float:
 
 
 def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
-    """Wheels that disagree all along, which is why their standard deviations were learned to be large."""
+    """Reason if the wheels disagree throughout, by more than the largest σ that is learned for them."""
     wheels = evidence.wheels
     known = np.isfinite(wheels.innovation)
     if not known.any() or np.median(wheels.innovation[known]) <= _MEDIAN_LIMIT:
@@ -269,7 +272,7 @@ def _listed(stretches: Sequence[Stretch]) -> str:
 
 
 def _nothing(evidence: Evidence) -> Iterator[str]:
-    """That no check found anything, why scans that are not well measured need none, and the checks made."""
+    """Reasons of a trustworthy verdict: no findings, why badly measured scans are harmless, the checks made."""
     kinds = {
         "fit the map badly": evidence.is_contradicted,
         "leave a direction open": evidence.is_degenerate,

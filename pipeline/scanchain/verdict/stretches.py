@@ -1,4 +1,4 @@
-"""Stretches of a trajectory that a check or loop closures contradict, or that no measurement constrains."""
+"""Suspicious segments of a trajectory: contradicted by a check or loop closures, or not constrained by scans."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
 from scanchain.graph.consistency import FEWEST, carried, connected
 from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, Kind, Stretch, WheelCheck
 
-_LEAST_OVERLAP = 2.0 / 3.0  # smallest ``overlap`` that is no finding
-_GAP = 3.0  # intervals of usual length above which the motion is not predicted
-_GAP_SCANS = 10  # longest gap within a stretch
-_PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
-_PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
-KNOWN = 0.5  # least share of scans that the wheels are compared at
-_RESTING_M = 0.05  # distance from copies to the next scan, within which the lidar rested
-_MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
+_LEAST_OVERLAP = 2.0 / 3.0  # smallest accepted ``overlap``
+_GAP = 3.0  # multiple of the median interval above which the motion is not predicted
+_GAP_SCANS = 10  # largest number of scans without a finding within a segment
+_PASSED_M = 1.0  # largest harmless extent of a segment of predicted or contradicted poses
+_PASSED_BY_WHEELS_M = 4.0  # the same where the wheels agree with the trajectory
+KNOWN = 0.5  # least share of scans with wheel odometry for it to count as known
+_RESTING_M = 0.05  # largest distance from copies to the next scan at which the lidar was at rest
+_MEDIAN_SCANS = 9  # window of the median of ``fit``; moving people contradict single scans
 
-_LEAST_M = 0.5  # smallest contradiction of a closure that is checked
-_NEAR_M = 10.0  # largest path between the ends of two closures of a group
-_AGREE_M, _AGREE_SHARE = 0.2, 0.02  # largest difference of two that agree: meters, and share of the path between
-_FINDABLE = 3000  # largest number of contradicting closures that are grouped; of more every n-th
+_LEAST_M = 0.5  # least translation error of a closure that is a contradiction
+_NEAR_M = 10.0  # largest path between two closures of a group, summed over both ends
+_AGREE_M, _AGREE_SHARE = 0.2, 0.02  # largest difference of two that agree: meters, and share of that path
+_FINDABLE = 3000  # largest number of contradicting closures that are grouped; of more, every n-th
 
-_FEWEST, _MOST = 3, 20  # closures around a stretch that decide: at least, and the shortest of more
-_MOST_PARTS = 8  # largest number of stretches within a closure that are told apart
-_RATIO = 1.0 / 3.0  # of what is left unexplained by the right source and by the wrong one, at most
-_EXPLAINED = 0.5  # share of a disagreement that the wrong source leaves, or that a jump of the wheels explains
+_FEWEST, _MOST = 3, 20  # least and largest number of closures around a segment that decide; the shortest are used
+_MOST_PARTS = 8  # largest number of segments within a closure; one with more is not used
+_RATIO = 1.0 / 3.0  # largest ratio of the residual with the right source to that with the wrong one
+_EXPLAINED = 0.5  # least share of a disagreement left by the wrong source, or explained by a jump of the wheels
 _IMPOSSIBLE_M = 1.0  # smallest change of the wheels' motion from scan to scan that is a jump
 
 
@@ -42,9 +42,9 @@ class Closures:
     """Closures that verification accepted.
 
     target, source : (C,) scans
-    T_target_source : (C, d+1, d+1) as measured
-    is_accepted : (C,) by the back end
-    tried : number of scans from which any was tried, accepted or not, as the trajectory returned to a place
+    T_target_source : (C, d+1, d+1) measured
+    is_accepted : (C,) True if the back end accepted it
+    tried : number of scans at revisited places for which a closure was tried, accepted or not
     """
 
     target: NDArray[np.int64]
@@ -56,22 +56,22 @@ class Closures:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence of every scan of a trajectory, (N,) each.
+    """Evidence for the verdict on a trajectory, mostly (N,) arrays with a value per scan.
 
-    seconds : since the first scan, by the log
+    seconds : log time since the first scan
     poses : (N, d+1, d+1) final
     is_lost, is_degenerate : states; False where unknown
     fit : as in ``Match``; NaN where unknown
-    starts_segment : scans whose motion from the one before is unknown
-    is_copy : scans that are the one before once more, to the last bit
-    points : valid returns
+    starts_segment : scans whose motion from the previous one is unknown
+    is_copy : scans that are bit-identical to the previous one
+    points : number of valid returns
     wheels, velocity, overlap : checks
     closures : those that verification accepted
     odometry : (N, d+1, d+1) before optimization; None where nothing was optimized
-    error : what is known of the error of a trajectory that is right everywhere, in words; empty for nothing
+    error : estimated error in words, valid outside of suspicious segments; empty where unknown
     bound_m : upper bound of that error; infinite where unknown
-    uncertain : the part of the log whose positions are the most uncertain, in words; empty for none
-    open_m : error of a pose that the noise of the ranges leaves open, twice its standard deviation
+    uncertain : the part of the log with the most uncertain positions, in words; empty for none
+    open_m : position uncertainty due to range noise, two standard deviations
     """
 
     seconds: Floats
@@ -104,7 +104,7 @@ class Evidence:
 
     @property
     def is_after_gap(self) -> NDArray[np.bool_]:
-        """(N,) scans before which the log has none for so long that the motion is not predicted."""
+        """(N,) scans after a gap in time over which the motion is not predicted."""
         intervals_s = np.diff(self.seconds, prepend=self.seconds[0])
         return intervals_s > _GAP * np.median(intervals_s)
 
@@ -113,7 +113,7 @@ class Evidence:
 
 
 def find_stretches(evidence: Evidence) -> list[Stretch]:
-    """Every stretch, by time, and those where the wheels slipped, which are none of the trajectory."""
+    """All suspicious segments in order of time, including those where only the wheels slipped."""
     has_left = (evidence.overlap < _LEAST_OVERLAP) & ~evidence.starts_segment
     median = median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest")
     fits_badly = (evidence.is_after_gap & ~evidence.is_held_by_wheels) | (median < LEAST_FIT)
@@ -135,10 +135,10 @@ def find_stretches(evidence: Evidence) -> list[Stretch]:
 
 
 def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> Iterator[Stretch]:
-    """Stretches that are too long to be passed by the predicted motion.
+    """Segments of marked scans that are too long for the prediction of the motion to be harmless.
 
-    A scan in between that is not marked measures the pose again, unless those beside it were inserted into the map
-    at poses that their correspondences contradict.
+    An unmarked scan in between measures the pose again, which ends the prediction. Not so between contradicted
+    scans: the map that it is matched to contains these at wrong poses.
     """
     for part in merged(is_marked):
         inner = merged(is_marked[part], 0 if kind is not Kind.CONTRADICTED else _GAP_SCANS)
@@ -149,7 +149,7 @@ def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> 
 
 
 def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
-    """Largest distance from the pose before a part; after a gap at least what the speed before it makes of it."""
+    """Largest distance from the pose before a part; after a time gap, at least the speed before times the gap."""
     positions, last = evidence.poses[:, :-1, -1], max(part.start - 1, 0)
     extent_m = float(np.linalg.norm(positions[part] - positions[last], axis=1).max())
     period_s = np.median(np.diff(evidence.seconds)) if evidence.is_after_gap[part.start] else 0.0
@@ -160,16 +160,17 @@ def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
 
 
 def _passed_m(evidence: Evidence, part: slice) -> float:
-    """Extent up to which a part is passed without harm: more where wheels are known and none contradicts."""
+    """Largest harmless extent of a part: larger where wheel odometry is known and agrees throughout."""
     innovation = evidence.wheels.innovation[part]
     is_held = np.isfinite(innovation).mean() >= KNOWN and not (innovation > WHEEL_LIMIT).any()
     return _PASSED_BY_WHEELS_M if is_held else _PASSED_M
 
 
 def _of_wheels(evidence: Evidence, measured: Sequence[Stretch]) -> Iterator[Stretch]:
-    """Stretches that wheels contradict, by which of the two slipped.
+    """Segments where wheels and trajectory disagree, each with the source that slipped.
 
-    measured : stretches of badly measured scans, where closures that agree with them may be of look-alikes
+    measured : segments of badly measured scans; closures that agree with them may join ambiguous places, so that
+        they are no proof that the wheels slipped
     """
     is_marked = evidence.wheels.innovation > WHEEL_LIMIT
     odometry, parts = evidence.poses if evidence.odometry is None else evidence.odometry, merged(is_marked)
@@ -197,9 +198,9 @@ def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:
 
 
 def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
-    """Stretches over which the driver was stuck, by what lies beside: a scan elsewhere, or none.
+    """Segments of copies from a stuck driver: the next scan is elsewhere, or the log begins or ends with them.
 
-    Simulated scans without noise are copies at rest, and the next one is still there.
+    Noise-free simulated scans at rest are identical, too, but the scan after them is at the same position.
     """
     positions = evidence.poses[:, :-1, -1]
     for part in merged(evidence.is_copy, 0):
@@ -211,7 +212,7 @@ def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
 
 
 def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
-    """Segments that no accepted closure joins to those before."""
+    """Segments that accepted closures do not connect to the first one."""
     segment = np.cumsum(evidence.starts_segment)
     closures = evidence.closures
     ends = np.stack([segment[closures.target], segment[closures.source]], axis=1)[closures.is_accepted]
@@ -224,7 +225,7 @@ def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
 
 
 def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
-    """Runs of marked scans, joined over gaps of a few scans."""
+    """Runs of marked scans, joined over up to ``gap`` unmarked ones."""
     places = np.flatnonzero(is_marked)
     parts = np.split(places, np.flatnonzero(np.diff(places) > gap + 1) + 1)
     return [slice(int(part[0]), int(part[-1]) + 1) for part in parts if len(part)]
@@ -234,16 +235,19 @@ def _stretch(
     evidence: Evidence, kind: Kind, part: slice, is_marked: NDArray[np.bool_], size_m: float | None = None,
     size_rad: float | None = None,
 ) -> Stretch:  # fmt: skip
-    """The stretch of a part of the scans, some of which are marked (N,)."""
+    """A finding for a part of the scans, some of which are marked (N,)."""
     start_s, end_s = evidence.seconds[[part.start, part.stop - 1]].tolist()
     count = int(is_marked[part].sum())
     return Stretch(kind, part.start, part.stop - 1, count, start_s, end_s, size_m, size_rad)
 
 
 def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> list[Stretch]:
-    """Scans that groups of closures span, at least three which agree, each far off the final poses (N, d+1, d+1).
+    """Segments between the ends of groups of at least three closures that agree, but contradict the final poses.
 
-    The motion from the first scan to the last is wrong by about as much, or the two places are alike.
+    Either the motion over the segment is wrong by about the same distance, or the two places are perceptually
+    aliased.
+
+    poses : (N, d+1, d+1) final
     seconds : (N,) of the scans
     """
     expected = lie.between(poses[closures.target], poses[closures.source])
@@ -279,17 +283,18 @@ def which_slipped(
 ) -> list[tuple[Kind, float]]:
     """Kind of slip, of scans or wheels, and its size in m, for each part of a trajectory where the two disagree.
 
-    A closure around a part measures once more where its two scans lie. It is predicted with the motion of each
-    part by scans or by wheels, in every combination, and with that of the rest by either, in the directions
-    of the scans. Of a part, the source is wrong without which the closures are predicted well, and with which they
-    are not. Wheels that jump, which no vehicle does, need no closure. Where nothing tells, the wheels disagree.
+    A closure around a part measures the relative pose of its two scans independently. It is predicted from the
+    motion of each part by scans or by wheels, in every combination, and from the motion outside of the parts by
+    either, with the rotations of the scans. In a part, a source slipped if the closures are predicted well without
+    it and badly with it. A jump of the wheels that no vehicle makes is slip without any closure. If neither source
+    can be identified, the kind is ``Kind.WHEELS``.
 
     odometry, wheels : (N, d+1, d+1), of the lidar; wheels NaN where unknown
     """
     steps = np.nan_to_num(
         lie.between(wheels[:-1], wheels[1:])[:, :-1, -1] - lie.between(odometry[:-1], odometry[1:])[:, :-1, -1]
     )
-    excess = np.zeros((len(odometry), odometry.shape[-1] - 1))  # of the wheels' path over that of the scans
+    excess = np.zeros((len(odometry), odometry.shape[-1] - 1))  # position by wheels minus that by scans
     excess[1:] = np.cumsum(np.einsum("nij,nj->ni", odometry[:-1, :-1, :-1], steps), axis=0)
     ends = np.array([(max(part.start - 1, 0), part.stop - 1) for part in parts], np.int64).reshape(-1, 2)
     apart = excess[ends[:, 1]] - excess[ends[:, 0]]
@@ -321,7 +326,7 @@ def which_slipped(
 
 
 def _left_m(off: Floats, apart: Floats, is_this: Floats) -> tuple[float, float]:
-    """Rest of ``off`` (d,) that the best combination of parts (K, d) leaves, with one by scans, by wheels."""
+    """Least residual of ``off`` (d,) over all combinations of parts (K, d): this part by scans, by wheels."""
     by_wheels = np.array(list(product((0.0, 1.0), repeat=len(apart))))
     left_m = np.linalg.norm(off - by_wheels @ apart, axis=1)
     has_this = by_wheels @ is_this > 0.0
@@ -329,7 +334,7 @@ def _left_m(off: Floats, apart: Floats, is_this: Floats) -> tuple[float, float]:
 
 
 def _decided(left_m: Floats, size_m: float) -> Kind:
-    """By what closures leave (C, 2, 2), with the rest by scans, by wheels, with the part by scans, by wheels."""
+    """Kind of slip from residuals (C, 2, 2) of closures: rest by scans or wheels, part by scans or wheels."""
     if len(left_m) < _FEWEST:
         return Kind.WHEELS
     by_scans, by_wheels = np.median(left_m, axis=0).T

@@ -1,4 +1,4 @@
-"""Logs that are no MCAP: an index whose messages are made when they are read, or of a temporary MCAP file."""
+"""Logs in formats other than MCAP: indexed with messages made on reading, or converted to a temporary MCAP."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scanchain.logs.writer import LogWriter, schema_text
 
 
 def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
-    """A new channel of the index, its messages in CDR; ``type_name`` is package/msg/Type."""
+    """New channel added to the index, with messages in CDR; ``type_name`` is package/msg/Type."""
     number = len(index.channels) + 1
     definition = schema_text(type_name)
     channel = Channel((index.number, number), topic, "cdr", number, type_name, "ros2msg", definition)
@@ -26,14 +26,14 @@ def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
 def add_block(
     index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
 ) -> None:
-    """Append a block: ``index.make`` finds it by ``offset``; ``size`` is about its number of bytes."""
+    """Append a block, which ``index.make`` finds by ``offset``; ``size`` is its approximate number of bytes."""
     held = {channel.key[1]: count for channel, count in counts.items() if count}
     span = min(times_ns), max(times_ns)
     index.blocks.append(Block(index.number, offset, size, "", size, *span, held))
 
 
 def temporary_index(path: Path, number: int, write: Callable[[LogWriter], None]) -> FileIndex:
-    """Index of the messages of a path that ``write`` converts, as the ``number``-th file of a log."""
+    """Index of the messages that ``write`` converts from a path, as the ``number``-th file of a log."""
     with TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True) as folder:
         copy = Path(folder) / "log.mcap"
         try:
@@ -41,18 +41,18 @@ def temporary_index(path: Path, number: int, write: Callable[[LogWriter], None])
                 write(log)
         except OSError as error:
             raise InputError(f"{copy}: {path} cannot be converted there ({error.strerror}); set TMPDIR") from error
-        index = index_file(copy, number)  # which maps the file: it may be deleted
+        index = index_file(copy, number)  # memory-maps the file, so it may be deleted
     index.path = path
     return index
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
-    """Sort key by which log_2 comes before log_10."""
+    """Sort key that puts log_2 before log_10."""
     return tuple(int(digits) for digits in re.findall(r"\d+", path.stem)), path.name
 
 
 def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
-    """A note on the files of a folder that hold scans, too, but are of another kind than those read."""
+    """Note on the files of a folder that contain scans as well, but in another format than those read."""
     counts = Counter(file.suffix.lower() for file in folder.iterdir() if file.is_file())
     others = ", ".join(f"{counts[each]:,} {each}" for each in suffixes if counts[each] and each != taken)
     if not others:
@@ -61,4 +61,4 @@ def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
 
 
 class UnknownFormatError(Exception):
-    """A file or folder that is no log of the assumed format: arguments are its text, and what is missing in it."""
+    """A file or folder that is not a log of the assumed format: arguments are its text and what it lacks."""

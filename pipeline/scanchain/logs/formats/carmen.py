@@ -1,7 +1,7 @@
-"""CARMEN logs, as text or packed by bzip2 or gzip: /scan, /odom, /tf_static and, of a simulator, /ground_truth.
+"""CARMEN logs as text, bzip2 or gzip: /scan, /odom, /tf_static and, from a simulator, /ground_truth.
 
-The order of the lines is kept: log time is the stamp of a scan, or a little more than that of the scan before
-where stamps step back. Format: https://carmen.sourceforge.net/logger_playback.html
+The order of the lines is preserved: the log time is the stamp of a scan or, where stamps step back, slightly later
+than that of the previous scan. Format: https://carmen.sourceforge.net/logger_playback.html
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
 SCANS = (b"FLASER", b"ROBOTLASER1")
-_LEAST_CODE_M = 81.83  # of a SICK LMS: from 8183 up its 13 bits are codes, such as that for no return
+_LEAST_CODE_M = 81.83  # smallest range in meters that a SICK LMS uses as an error code, such as for no return
 _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
 _HALF_TURN = math.pi
 
-_MOST_RATIO, _LEAST_BYTES = 200, 1 << 24  # largest ratio of packing, beyond so many bytes of text
-_AT_ONCE = 256  # bytes of text that are unpacked at once, of which damage loses all
-_LONGEST_LINE = 1 << 18  # bytes of a line; a longer one is malformed
-_HEAD_LINES = 256  # lines of text by which files of other kinds are recognized
+_MOST_RATIO, _LEAST_BYTES = 200, 1 << 24  # largest compression ratio, applied beyond _LEAST_BYTES of text
+_AT_ONCE = 256  # bytes of text decompressed at once, all of which are lost where they are damaged
+_LONGEST_LINE = 1 << 18  # largest length of a line in bytes; a longer one is malformed
+_HEAD_LINES = 256  # number of first lines from which files of other formats are recognized
 
 
 def is_carmen(head: bytes) -> bool:
-    """True if a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
+    """True if a file is compressed, or begins with a comment or a word of capitals and digits as in CARMEN."""
     word = head.split(maxsplit=1)[0] if head.strip() else b""
     is_word = word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper()
     return head.startswith((b"BZh", b"\x1f\x8b")) or word.startswith(b"#") or is_word
 
 
 def index_carmen(path: Path, number: int) -> FileIndex:
-    """The messages of a log's lines. Raises UnknownFormatError where the file has none of a known kind."""
+    """Index of the messages of a log's lines. Raises UnknownFormatError if no line is of a known kind."""
     malformed, damage = [0, 0], list[str]()
     others = Counter[bytes]()
     index = temporary_index(path, number, lambda log: _write(log, read_lines(path, damage), malformed, others))
@@ -74,7 +74,11 @@ def index_carmen(path: Path, number: int) -> FileIndex:
 
 
 def _write(log: LogWriter, lines: Iterator[bytes], malformed: list[int], others: Counter[bytes]) -> None:
-    """Write the messages of each line of a known kind; ``malformed`` becomes the first such and their number."""
+    """Write the messages of each line of a known kind.
+
+    malformed : set to the number of the first malformed line and the count of malformed lines
+    others : incremented by the number of lines of each unknown kind
+    """
     parameters: dict[bytes, float] = {}
     scan_ns, is_mounted = 0, False
     for number, line in enumerate(lines, start=1):
@@ -88,7 +92,7 @@ def _write(log: LogWriter, lines: Iterator[bytes], malformed: list[int], others:
             with suppress(ValueError, IndexError):
                 parameters[words[1]] = float(words[2])
             continue
-        try:  # the stamp is the third word from behind, a double like in CARMEN
+        try:  # the stamp is the third word from the end, a double as in CARMEN
             stamp_ns = int(float(words[-3]) * 1e9)
             if not 0 <= stamp_ns < LATEST_NS:
                 raise ValueError
@@ -112,11 +116,11 @@ def _write(log: LogWriter, lines: Iterator[bytes], malformed: list[int], others:
 
 
 def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float]) -> tuple[bytes, Any, Any]:
-    """A FLASER or ROBOTLASER1 line as a message, the robot's pose, and that of the laser on the robot.
+    """Message of a FLASER or ROBOTLASER1 line, the robot's pose, and the pose of the laser on the robot.
 
-    parameters : the scanner's reach and its place ahead of the robot's center, as the log's PARAM lines set them
-        for FLASER; ROBOTLASER1 states both itself
-    Raises ValueError or IndexError where words are missing or no numbers.
+    parameters : the scanner's maximum range and its forward offset from the robot's center, as set by the log's
+        PARAM lines for FLASER; ROBOTLASER1 lines state both themselves
+    Raises ValueError or IndexError if words are missing or not numbers.
     """
     offset_m, max_range_m = (parameters.get(name, 0.0) for name in _PARAMETERS)
     if words[0] == b"FLASER":
@@ -142,7 +146,7 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
 
 
 def planar(x_m: float, y_m: float, yaw_rad: float) -> Any:
-    """A place in the plane."""
+    """Pose in the plane, as a message."""
     return place_of((x_m, y_m, 0.0), (0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)))
 
 
@@ -153,9 +157,10 @@ def _numbers(words: list[bytes], count: int) -> list[float]:
 
 
 def read_lines(path: Path, damage: list[str]) -> Iterator[bytes]:
-    """The lines of a file, unpacked; what is missing of them is added to the damage.
+    """Lines of a file, decompressed; lost text is added to ``damage``.
 
-    A line that is too long is cut. Raises InputError where a file cannot be read or unpacks to more than any log.
+    A line that is too long is cut. Raises InputError if a file cannot be read or decompresses to more than any
+    log does.
     """
     size, text = 0, bytearray()
     try:
@@ -173,7 +178,7 @@ def read_lines(path: Path, damage: list[str]) -> Iterator[bytes]:
                     yield from lines
                     text = bytearray(rest[:_LONGEST_LINE])
     except (zlib.error, EOFError, ValueError, OSError) as error:
-        if isinstance(error, OSError) and error.errno is not None:  # of the system, not of bz2 or gzip
+        if isinstance(error, OSError) and error.errno is not None:  # raised by the system, not by bz2 or gzip
             raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
         damage.append(f"{path}: does not unpack beyond byte {size} of the text ({error})")
     yield from bytes(text).split(b"\n")

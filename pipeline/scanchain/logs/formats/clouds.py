@@ -1,4 +1,4 @@
-"""A folder of PCD, PLY, .npy or raw .bin files, one a scan; stamps by their names, or at a rate.
+"""Folders of PCD, PLY, .npy or raw .bin files, one per scan, stamped by file name or at a fixed rate.
 
 PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. PLY: Turk 1994.
 """
@@ -25,8 +25,8 @@ from scanchain.logs.formats import add_block, add_channel, left_out, natural_ord
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
-_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # nanoseconds of a stamp's unit, by its number of digits since 2001
-_FIRST_FILES = 3  # number of files of which one has to be readable
+_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # a stamp's unit in nanoseconds, by its number of digits since 2001
+_FIRST_FILES = 3  # number of first files that are tried for the note on the fields
 _NS = 1_000_000_000
 
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
@@ -36,7 +36,7 @@ XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 _PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8"} | {
     (sign, str(size)): f"<{code}{size}" for sign, code in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
 }
-_MOST_LZF_RATIO = 1000  # largest ratio of packing that is accepted; LZF reaches about 130
+_MOST_LZF_RATIO = 1000  # largest accepted compression ratio; LZF reaches about 130
 
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -44,9 +44,9 @@ _PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_MOST_HEADER_LINES, _MOST_DIGITS = 1000, 20  # of a header, and of a count in it
+_MOST_HEADER_LINES, _MOST_DIGITS = 1000, 20  # largest number of lines of a header, and of digits of a count in it
 
-_ONE_AT_A_TIME = Lock()  # of headers, which NumPy parses by ast: threads of Python 3.11 disturb each other in it
+_ONE_AT_A_TIME = Lock()  # for .npy headers: NumPy parses them with ast, which is not thread-safe in Python 3.11
 
 
 class CloudFileError(Exception):
@@ -57,8 +57,8 @@ class CloudFileError(Exception):
 
 
 def _rows(file: IO[bytes], point: np.dtype[np.void], count: int, *, is_text: bool) -> NDArray[np.void]:
-    """``count`` points, one after the other, or as many lines of numbers."""
-    size = os.fstat(file.fileno()).st_size  # whatever a header claims
+    """The next ``count`` points of a file, packed one after another, or one line of numbers per point."""
+    size = os.fstat(file.fileno()).st_size  # limits what a header may claim
     if is_text:
         if point.itemsize > 8 * size:
             raise CloudFileError(f"ends after 0 of its {count} points")
@@ -76,10 +76,10 @@ def _rows(file: IO[bytes], point: np.dtype[np.void], count: int, *, is_text: boo
 
 
 def read_cloud_file(path: Path, raw: np.dtype[np.void] = XYZI) -> NDArray[np.void]:
-    """The points (N,) of a file as they are, little endian, in number types of ROS.
+    """Unfiltered points (N,) of a file, little-endian, in number types that ROS supports.
 
-    raw : a point of a .bin file
-    Raises CloudFileError, and OSError where the file cannot be read.
+    raw : layout of a point of a .bin file
+    Raises CloudFileError if the file is malformed, OSError if it cannot be read.
     """
     readers = {".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".bin": lambda path: read_raw(path, raw)}
     rows = readers[path.suffix.lower()](path)
@@ -92,7 +92,7 @@ def read_cloud_file(path: Path, raw: np.dtype[np.void] = XYZI) -> NDArray[np.voi
 
 
 def read_raw(path: Path, point: np.dtype[np.void]) -> NDArray[np.void]:
-    """The points of a file without a header."""
+    """Points of a file without a header."""
     size = path.stat().st_size
     if size % point.itemsize:
         names = ", ".join(point.names or ())
@@ -101,13 +101,13 @@ def read_raw(path: Path, point: np.dtype[np.void]) -> NDArray[np.void]:
 
 
 def read_npy(path: Path) -> NDArray[np.void]:
-    """The points of a NumPy array, (N, 3) or more columns, x y z first, or (N,) with fields of these names."""
+    """Points of a NumPy array, (N, 3) or more columns with x y z first, or (N,) with fields x, y, z."""
     try:
         with _ONE_AT_A_TIME:
             array = np.load(path, allow_pickle=False)
     except OSError:
         raise
-    except Exception as error:  # whatever a damaged header makes NumPy, ast and tokenize raise
+    except Exception as error:  # anything that NumPy, ast and tokenize raise for a damaged header
         raise CloudFileError("is no .npy array of numbers") from error
     if not isinstance(array, np.ndarray):
         raise CloudFileError("is an archive of arrays, no .npy array; save each cloud in a file of its own")
@@ -122,26 +122,26 @@ def read_npy(path: Path) -> NDArray[np.void]:
 
 
 def point_of_columns(kind: np.dtype[np.generic], count: int) -> np.dtype[np.void]:
-    """A point of so many numbers of a kind."""
+    """Layout of a point of ``count`` numbers of type ``kind``."""
     names = ["x", "y", "z", "intensity", *(f"column_{k}" for k in range(5, count + 1))][:count]
     return np.dtype([(name, kind.str) for name in names])
 
 
 def _ros_type(kind: np.dtype[np.generic]) -> str:
-    """The number type itself, little endian; float64 for one that ROS lacks, float32 for one of 16 bits."""
+    """Little-endian number type; float64 for 8-byte integers and floats ROS lacks, float32 for 16-bit floats."""
     if kind.kind == "f" and kind.itemsize not in (4, 8):
         return "<f4" if kind.itemsize == 2 else "<f8"
     return "<f8" if kind.itemsize == 8 else kind.newbyteorder("<").str.replace("|", "<")
 
 
 def read_pcd(path: Path) -> NDArray[np.void]:
-    """The points of a file, ascii, binary or binary_compressed, fields as they are."""
+    """Points of a PCD file (ascii, binary or binary_compressed) with all its fields."""
     with path.open("rb") as file:
         header = {words[0]: words[1:] for words in _header_lines(file, "DATA") if words}
         try:
             names, kinds = header["FIELDS"], list(zip(header["TYPE"], header["SIZE"], strict=True))
             counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-            fields = [  # several numbers of one field are one
+            fields = [  # a field with COUNT > 1 becomes one subarray
                 (f"_{place}" if name == "_" else name, _PCD_TYPES[kind], (count,) if count > 1 else ())
                 for place, (name, kind, count) in enumerate(zip(names, kinds, counts, strict=True))
             ]
@@ -156,7 +156,7 @@ def read_pcd(path: Path) -> NDArray[np.void]:
 
 
 def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
-    """The words of each line up to the one that begins with ``last``, or the first thousand."""
+    """Words of each line up to the one that begins with ``last``, at most of the first thousand lines."""
     for _ in range(_MOST_HEADER_LINES):
         words = file.readline(65536).decode("ascii", "replace").split()
         yield words
@@ -165,7 +165,7 @@ def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
 
 
 def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """Points that are packed by LZF, field by field."""
+    """Points compressed by LZF, stored field by field."""
     packed_size, size = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     packed = file.read(packed_size)
     if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
@@ -187,14 +187,14 @@ def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDAr
 
 
 def read_ply(path: Path) -> NDArray[np.void]:
-    """The vertices of a file, ascii or binary in either byte order, fields as they are."""
+    """Vertices of a PLY file (ascii, or binary in either byte order) with all their properties."""
     with path.open("rb") as file:
         point, count, form = _ply_header(file)
         return _rows(file, point, count, is_text=form == "ascii")
 
 
 def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
-    """The layout of a vertex, their number, and the form; vertices must come first, as they do."""
+    """Layout of a vertex, number of vertices, and format; the vertices must be the first element."""
     fields: list[tuple[str, str]] = []
     form, element, count, words = "", "", 0, list[str]()
     for words in _header_lines(file, "end_header"):
@@ -218,11 +218,11 @@ def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
 
 
 def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: int = 4) -> FileIndex:
-    """The files of the first kind that a folder has, as the scans of /points.
+    """Index of a folder's files as the scans of /points; of several formats the first in SUFFIXES is read.
 
-    rate_hz : at which they come, from the epoch on; 0 takes the stamps from the names
-    bin_columns : float32 numbers of a point in .bin files
-    Raises InputError where names hold no stamps, or files no such points.
+    rate_hz : rate of the scans, stamped from the epoch on; 0 takes the stamps from the names
+    bin_columns : number of float32 values per point in .bin files
+    Raises InputError if the names contain no stamps, or the .bin files do not have such points.
     """
     found = sorted((file for file in folder.iterdir() if file.is_file()), key=natural_order)
     kinds = {suffix: [file for file in found if file.suffix.lower() == suffix] for suffix in SUFFIXES}
@@ -263,7 +263,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
 def contents_of(
     file: Path, channel: Channel, stamp_ns: int, read: Callable[[Path], NDArray[np.void]], frame: str = "lidar"
 ) -> Contents:
-    """A cloud file as the one message of a block; a malformed one where it cannot be read."""
+    """Contents of a block with a cloud file as its only message, malformed if the file cannot be read."""
     try:
         data = pack_cloud(stamp_ns, frame, read(file))
     except (CloudFileError, OSError) as error:
@@ -273,7 +273,7 @@ def contents_of(
 
 
 def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:
-    """A note on the fields of the files, by the first that can be read."""
+    """Note on the fields of the files, by the first file that can be read."""
     for file in files[:_FIRST_FILES]:
         with suppress(CloudFileError, OSError):
             points = read_cloud_file(file, raw)
@@ -288,10 +288,10 @@ def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[
 
 
 def stamp_of_name(stem: str) -> int | None:
-    """The stamp in nanoseconds in a file's name, None where there is none.
+    """Stamp in nanoseconds in a file's name, None if there is none.
 
-    Understood are nanoseconds, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a
-    fraction (``12.375``), and seconds and nanoseconds apart (``cloud_1583836591_182590976``).
+    Supported are nano-, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a fraction
+    (``12.375``), and seconds and nanoseconds separately (``cloud_1583836591_182590976``).
     """
     stamp_ns = LATEST_NS
     if match := re.search(r"(?<!\d)(\d{1,10})\.(\d{1,9})$", stem):

@@ -1,4 +1,4 @@
-"""KITTI's folders: sweeps of the raw recordings and of the odometry benchmark, with their ground truth.
+"""KITTI folders: lidar sweeps of the raw recordings and of the odometry benchmark, with ground truth.
 
 Geiger, Lenz, Stiller & Urtasun 2013, "Vision meets robotics: the KITTI dataset".
 """
@@ -24,28 +24,28 @@ from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_odometry, place
 
-_TRUTH = -1  # index of the block of the ground truth
+_TRUTH = -1  # offset that marks the block of the ground truth
 _POSE_BYTES = 720
 _TIME = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?$")
 Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 _EARTH_M = 6378137.0
-_MOST_LATITUDE = 89.0  # largest latitude in degrees; Mercator's projection has no poles
-_MOST_NUMBER = 1e12  # largest number in a table, of meters, seconds or degrees; one beyond is damage
-_MOST_CALIBRATION = 1e6  # largest number in a calibration; one beyond, infinite or no number is damage
+_MOST_LATITUDE = 89.0  # largest latitude in degrees; the Mercator projection is singular at the poles
+_MOST_NUMBER = 1e12  # largest number in a table, in meters, seconds or degrees; a larger one indicates damage
+_MOST_CALIBRATION = 1e6  # largest number in a calibration; a larger one, infinity or NaN indicates damage
 _NS = 1_000_000_000
 
 
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
-    """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
+    """Index of a drive of the raw recordings (``..._sync``); ground truth is its GPS/INS, moved to the lidar."""
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
     return _index(FileIndex(folder, number), folder / "velodyne_points/data", times_ns, lambda: _raw_truth(folder))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
-    """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
+    """Index of a sequence of the odometry benchmark (``sequences/00``) with ground truth in ``poses/00.txt``."""
     times = folder / "times.txt"
-    times_ns = _checked(times, np.rint(_table(times, 1)[:, 0] * _NS))  # lines of seconds
+    times_ns = _checked(times, np.rint(_table(times, 1)[:, 0] * _NS))  # one line of seconds per scan
     return _index(
         FileIndex(folder, number), folder / "velodyne", times_ns, lambda: _benchmark_truth(folder, times_ns)
     )
@@ -75,7 +75,7 @@ def _benchmark_truth(folder: Path, times_ns: Sequence[int]) -> Truth:
 
 
 def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: Callable[[], Truth]) -> FileIndex:
-    """/velodyne_points from the files, whose names count the times, and /ground_truth where it can be read."""
+    """Index of /velodyne_points, and of /ground_truth if readable; a file's name is the index of its time."""
     files, truth = sorted(folder.glob("*.bin"), key=natural_order), Truth()
     if not files:
         raise InputError(f"{folder}: has no .bin file; of the raw recordings take the synced ones (..._sync)")
@@ -110,7 +110,7 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
 
 
 def read_times(file: Path) -> list[int]:
-    """Nanoseconds of each line ``2011-09-26 13:02:25.594360375``, which is taken as UTC."""
+    """Times in nanoseconds of lines such as ``2011-09-26 13:02:25.594360375``, taken as UTC."""
     try:
         if odd := next((line for line in _lines(file) if not _TIME.match(line)), ""):
             raise ValueError(shown(odd))
@@ -127,7 +127,7 @@ def _checked(file: Path, times_ns: NDArray[np.int64] | Matrix) -> list[int]:
 
 
 def _entry(file: Path, name: str, shape: tuple[int, ...]) -> Matrix:
-    """The numbers of the line ``name: numbers``."""
+    """Numbers of the line ``name: numbers``."""
     entries = dict(line.split(":", 1) for line in _lines(file) if ":" in line)
     try:
         numbers = np.array(entries[name].split(), np.float64).reshape(shape)
@@ -140,10 +140,10 @@ def _entry(file: Path, name: str, shape: tuple[int, ...]) -> Matrix:
 
 
 def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
-    """T_world_lidar (N, 4, 4) of the GPS/INS readings, from the first lidar pose on.
+    """T_world_lidar (N, 4, 4) of the GPS/INS readings, relative to the first lidar pose.
 
-    Latitude and longitude are laid out by the Mercator projection at the first latitude; R = Rz(yaw) Ry(pitch)
-    Rx(roll), as KITTI's development kit defines them.
+    Latitude and longitude are projected by the Mercator projection scaled at the first latitude; R = Rz(yaw)
+    Ry(pitch) Rx(roll), both as in KITTI's development kit.
     """
     rows = np.vstack([_table(file, 6)[:1] for file in sorted(folder.glob("*.txt"))] or [np.empty((0, 6))])
     if not len(rows):
@@ -162,7 +162,7 @@ def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
 
 
 def read_camera_poses(file: Path, calibration: Path) -> Matrix:
-    """T_world_lidar (N, 4, 4) of the odometry benchmark's camera poses, from the first lidar pose on."""
+    """T_world_lidar (N, 4, 4) of the odometry benchmark's camera poses, relative to the first lidar pose."""
     rows = _table(file, 12)
     T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
     T_world_camera[:, :3] = rows.reshape(-1, 3, 4)
@@ -172,7 +172,7 @@ def read_camera_poses(file: Path, calibration: Path) -> Matrix:
 
 
 def _table(file: Path, columns: int) -> Matrix:
-    """The first columns of a file of numbers, none of them beyond all measure."""
+    """First columns of a file of numbers. Raises InputError if one is not finite or implausibly large."""
     lines = _lines(file)
     try:
         rows = np.loadtxt(lines, comments=None, usecols=range(columns), ndmin=2) if lines else np.empty(0)

@@ -1,8 +1,8 @@
-"""ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
+"""ROS 1 bags, complete or truncated, indexed or not; their messages are not converted.
 
-Bags are walked record by record; the messages of a chunk are counted by the INDEX records behind it if the end of
-the bag lists the same, else, and in all chunks of a damaged bag, by unpacking it. A record is what its fields are
-those of, whatever its opcode.
+Bags are walked record by record. The messages of a chunk are counted by the INDEX records after it if the end of
+the bag states the same counts, else, and in all chunks of a damaged bag, by decompressing it. The type of a record
+is determined by its fields where its opcode contradicts them.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -35,7 +35,7 @@ _TIME = struct.Struct("<II")  # seconds, nanoseconds
 _COUNT = struct.Struct("<II")  # connection, number of its messages
 _ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
 _LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
-_FIELDS = {  # a field that only such a record has; "count" is looked for last
+_FIELDS = {  # a field that identifies each type of record; "count" is checked last
     MESSAGE: b"time", HEADER: b"index_pos", CHUNK: b"compression", CHUNK_INFO: b"chunk_pos", CONNECTION: b"topic",
     INDEX: b"count",
 }  # fmt: skip
@@ -45,9 +45,9 @@ _MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
 
 
 class Record(NamedTuple):
-    """A record: its fields by name, and where it begins, its data begin and it ends, maybe beyond the file.
+    """A record: its fields by name, the bytes where it and its data begin, and its end, maybe beyond the file's.
 
-    opcode : by its fields; the one that is stated may be another
+    opcode : according to the fields; the opcode stated in the file may differ
     """
 
     opcode: int
@@ -57,16 +57,16 @@ class Record(NamedTuple):
     end: int
 
     def number(self, name: bytes) -> int:
-        """A field that is a whole number. Raises struct.error where it is absent or of another size."""
+        """Value of an integer field. Raises struct.error if it is absent or of another size."""
         return _LENGTH.unpack(self.fields.get(name, b""))[0]
 
     def text(self, name: bytes) -> str:
-        """A field that is text, empty where it is absent."""
+        """Value of a text field, empty if it is absent."""
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
 def read_record(data: Data, offset: int) -> Record | None:
-    """The record that begins at the offset, None where none does."""
+    """Record that begins at the offset, None if there is none."""
     begin = offset + _LENGTH.size
     length = _LENGTH.unpack_from(data, offset)[0] if begin <= len(data) else _LONGEST_HEAD + 1
     end = begin + length
@@ -98,7 +98,7 @@ def _define(index: FileIndex, record: Record, data: Data) -> None:
 def read_records(
     data: Data, offset: int, sought: re.Pattern[bytes], gaps: list[tuple[int, int]]
 ) -> Iterator[Record]:
-    """The records one after the other; after damage, added to ``gaps``, those from the next match on."""
+    """Successive records; damaged ranges are added to ``gaps``, and reading resumes at the next match."""
     record = read_record(data, offset)
     while offset < len(data):
         following = None if record is None else read_record(data, record.end)
@@ -117,8 +117,8 @@ def read_records(
 def next_record(data: Data, offset: int, stated_end: int, sought: re.Pattern[bytes]) -> Record | None:
     """The first record after the offset whose opcode matches; None where there is none.
 
-    stated_end : byte at which the damaged record ends if its length is right; no connection before it is taken, as
-        chunks hold such too
+    stated_end : byte at which the damaged record ends if its length is right; connections before it are ignored,
+        because chunks contain connections too
     """
     for match in sought.finditer(data, offset + 1):
         for begin in range(match.start() - _LENGTH.size, max(offset, match.start() - _MOST_BEFORE), -1):
@@ -131,7 +131,7 @@ def next_record(data: Data, offset: int, stated_end: int, sought: re.Pattern[byt
 
 
 def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
-    """The fields of a record's head by name, None where it is not made of fields."""
+    """Fields of a record's header by name, None if it is not a list of fields."""
     fields: dict[bytes, bytes] = {}
     offset = 0
     while offset < len(head):
@@ -166,9 +166,9 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
 
 
 def _walk(index: FileIndex) -> dict[int, dict[int, int]]:
-    """Take in chunks and connections; returned are the messages by connection that the end of the bag lists.
+    """Add chunks and connections to the index; return the message counts that the end of the bag states.
 
-    They are those of each chunk, by where it begins.
+    They are by the byte where a chunk begins, then by connection.
     """
     gaps: list[tuple[int, int]] = []
     stated: dict[int, dict[int, int]] = {}
@@ -189,7 +189,7 @@ def _walk(index: FileIndex) -> dict[int, dict[int, int]]:
 
 
 def _take(index: FileIndex, record: Record, stated: dict[int, dict[int, int]]) -> None:
-    """Take in a record. Raises struct.error or ValueError where its fields are none."""
+    """Add a record to the index. Raises struct.error or ValueError if it is malformed."""
     if record.opcode == CONNECTION:
         _define(index, record, index.data)
     elif record.opcode == CHUNK:
@@ -203,9 +203,10 @@ def _take(index: FileIndex, record: Record, stated: dict[int, dict[int, int]]) -
 
 
 def _count(index: FileIndex, stated: dict[int, dict[int, int]]) -> None:
-    """Unpack the chunks whose messages are not counted twice alike, by the records behind them and in the end.
+    """Count messages by decompressing chunks whose INDEX records are absent or contradict the end of the bag.
 
-    Where no end of the bag counts them, all chunks are read for any topic.
+    In a damaged bag these are all chunks. If an undamaged bag states no counts at its end, all chunks are read for
+    any topic.
     """
     is_sure = not index.damage
     index.is_consistent = bool(stated) or not is_sure
@@ -220,7 +221,7 @@ def _count(index: FileIndex, stated: dict[int, dict[int, int]]) -> None:
 
 
 def _chunk(index: FileIndex, record: Record) -> Block:
-    """A chunk, its messages not counted. Raises struct.error or ValueError where its fields are none."""
+    """Block of a chunk, its messages not yet counted. Raises struct.error or ValueError if it is malformed."""
     end = len(index.data)
     size, claimed = min(record.end, end) - record.begin, record.number(b"size")
     if claimed > most_unpacked(size):
@@ -231,7 +232,7 @@ def _chunk(index: FileIndex, record: Record) -> Block:
 
 
 def _indexed(index: FileIndex, record: Record) -> Block:
-    """The last chunk, with the messages of a connection that an INDEX lists."""
+    """Block of the last chunk, updated by the messages of a connection that an INDEX record lists."""
     block, entries = index.blocks[-1], np.frombuffer(index.data[record.begin : record.end], _ENTRY)
     if not len(entries):
         return block
@@ -244,7 +245,7 @@ def _indexed(index: FileIndex, record: Record) -> Block:
 
 
 def _counted(index: FileIndex, block: Block) -> Block:
-    """A chunk whose messages have been counted by unpacking it."""
+    """Block of a chunk whose messages have been counted by decompressing it."""
     messages = messages_of(index, block)
     counts = Counter(message.channel.key[1] for message in messages)
     times_ns = [message.log_time_ns for message in messages] or [0]
@@ -252,7 +253,7 @@ def _counted(index: FileIndex, block: Block) -> Block:
 
 
 def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Contents:
-    """The messages of a chunk; connections found there join the index."""
+    """Messages of a chunk; connections found in it are added to the index."""
     name = f"{index.path}: the chunk at byte {block.offset}"
     messages: list[Message] = []
     met = Counter[int]()

@@ -1,4 +1,4 @@
-"""ROS 2 bags, read by rosbags; a damaged database of SQLite by a copy of the rows that it still gives."""
+"""ROS 2 bags, read by rosbags; of a damaged SQLite database the rows that are still readable are copied first."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from scanchain.logs.mcap.index import most_unpacked
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import schema_text
 
-_BLOCK_BYTES = 4_000_000  # size of a block in bytes of the file, about
+_BLOCK_BYTES = 4_000_000  # approximate size of a block in bytes of the file
 _MOST_BLOCKS = 8192
-_MOST_UNPACKED = 1 << 27  # largest number of bytes that the messages of a block unpack to
-_MOST_RATIO, _LEAST_BYTES = 200, 1 << 25  # largest ratio of packing of a whole file, beyond so many bytes
+_MOST_UNPACKED = 1 << 27  # largest decompressed size of the messages of a block in bytes
+_MOST_RATIO, _LEAST_BYTES = 200, 1 << 25  # largest compression ratio of a file, applied beyond _LEAST_BYTES
 _LATEST_NS = (1 << 63) - 1
 _MODE = re.compile(r"^( *compression_mode:)[ \"']*(\w*).*$", re.MULTILINE)
 _COUNT = re.compile(r"^  message_count: *(\d{1,15})$", re.MULTILINE)
 
-_ROW_BYTES = 16  # bytes of a file that a row takes at least
-_MOST_FAILURES = 5_000  # ranges of rows that fail in a table, about half a second
+_ROW_BYTES = 16  # smallest number of bytes of a row
+_MOST_FAILURES = 5_000  # largest number of failed queries per table, about half a second
 _TABLES = (
     "SELECT name, sql FROM sqlite_master WHERE name IN ('schema', 'topics', 'message_definitions', 'messages')"
 )
@@ -47,7 +47,7 @@ CREATE INDEX timestamp_idx ON messages (timestamp);
 
 
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
-    """The topics of a .db3 or the folder of a ROS 2 bag; blocks are spans of time. Raises InputError for none."""
+    """Index of a .db3 or the folder of a ROS 2 bag, in blocks of equal time. Raises InputError if not readable."""
     bag = _Bag(path)
     index, reader = FileIndex(path, number, damage=[bag.damage] if bag.damage else []), bag.reader
     for id_, each in enumerate(reader.connections, start=1):
@@ -66,7 +66,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     lost = reader.message_count - sum(each.msgcount for each in reader.connections)
     if lost > 0 and not bag.damage:
         index.damage.append(f"{path}: {counted(lost, 'message')} of no topic that it lists")
-    if index.channels:  # spans of one length, so many that each holds a few megabytes on average
+    if index.channels:  # spans of equal length, each with a few megabytes on average
         size, length_ns = size_of(path), reader.end_time - bag.begin_ns
         count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
         edges_ns = [bag.begin_ns + length_ns * place // count for place in range(count + 1)]
@@ -80,8 +80,8 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
 
 
 def parts_of_bag(folder: Path) -> list[Path]:
-    """The MCAP files of a ROS 2 bag in their order; the folder itself for another storage or a packed bag."""
-    from ruamel.yaml import YAML  # a tenth of a second with rosbags, which other logs need not wait for
+    """MCAP files of a ROS 2 bag in order; the folder itself for another storage or a compressed bag."""
+    from ruamel.yaml import YAML  # importing it takes 0.1 s with rosbags, not needed for other logs
     from ruamel.yaml.error import YAMLError
 
     try:
@@ -96,9 +96,10 @@ def parts_of_bag(folder: Path) -> list[Path]:
 
 
 class _Bag:
-    """A bag and its reader, of rosbags, which one thread at a time uses; ``folder`` is that of a copy.
+    """A bag with its rosbags reader, used by one thread at a time.
 
-    begin_ns : first log time that is not 0
+    folder : temporary folder of a decompressed or rescued copy, if any
+    begin_ns : first nonzero log time
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,7 +112,7 @@ class _Bag:
             self._copy("*.zstd", _unpack)
         try:
             self._open()
-        except Exception as error:  # whatever a damaged file makes the libraries below raise
+        except Exception as error:  # anything that libraries raise for a damaged file
             self._rescue(one_line(error))
 
     def _open(self) -> None:
@@ -119,13 +120,13 @@ class _Bag:
 
         reader: Any = rosbag2.Reader(self.opened)
         reader.open()
-        if self.is_packed:  # messages are unpacked here, as rosbags sets no limit
+        if self.is_packed:  # messages are decompressed below, as rosbags sets no limit
             reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
         self.begin_ns = reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
         self.reader = reader
 
     def _copy(self, pattern: str, copy: Callable[[Path, Path], None]) -> None:
-        """Copy the files into a folder that goes with the bag. Raises InputError where there is no room."""
+        """Copy the files into a temporary folder. Raises InputError if that fails, as for lack of space."""
         folder = TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True)
         into, is_folder = Path(folder.name), self.opened.is_dir()
         try:
@@ -138,7 +139,7 @@ class _Bag:
         self.folder, self.opened = folder, into if is_folder else into / self.opened.name
 
     def _rescue(self, reason: str) -> None:
-        """Go on with what SQLite still gives. Raises InputError where that is nothing."""
+        """Continue with the rows that SQLite can still read. Raises InputError if there are none."""
         remedy = "sqlite.org's sqlite3 saves part of a .db3 by .recover, ros2 bag reindex a folder"
         self.damage = f"{self.path}: cannot be read as a ROS bag ({reason}); copy it again; {remedy}"
         counts = Counter[str]()
@@ -157,7 +158,7 @@ class _Bag:
         self.damage = f"{self.path}: {lost} lost: damaged pages; the others were read row by row"
 
     def contents(self, index: FileIndex, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a span of time; both ends reach as far as time, whatever the metadata."""
+        """Messages of a block's time span, open-ended for the first and last block: the metadata may be wrong."""
         begin_ns, end_ns = block.start_ns if block.offset else 0, block.end_ns + 1
         end_ns = _LATEST_NS if block.offset == len(index.blocks) - 1 else end_ns
         chosen = {key: c for key, c in self.channels.items() if wanted is None or c.key[1] in wanted}
@@ -168,7 +169,7 @@ class _Bag:
             try:
                 for each, time_ns, data in reader.messages(connections, begin_ns, end_ns) if connections else ():
                     found.append((chosen[each.topic, each.msgtype], time_ns, data))
-            except Exception as error:  # whatever a damaged file makes the libraries below raise
+            except Exception as error:  # anything that libraries raise for a damaged file
                 with suppress(InputError):
                     self._rescue(one_line(error))
         if self.reader is not reader:
@@ -182,7 +183,7 @@ class _Bag:
 
 
 def _unpacked(data: bytes, left: int) -> tuple[bytes, str]:
-    """A message that is packed by itself, and why it does not unpack, empty where it does."""
+    """Decompressed data of an individually compressed message, and the reason for a failure, empty if none."""
     most = min(most_unpacked(len(data)), left)
     try:
         if zstandard.frame_content_size(data) > most:
@@ -193,7 +194,7 @@ def _unpacked(data: bytes, left: int) -> tuple[bytes, str]:
 
 
 def _unpack(file: Path, unpacked: Path) -> None:
-    """Unpack a file up to any damage. Raises InputError for one beyond all measure."""
+    """Decompress a file up to the first damage. Raises InputError if the result is implausibly large."""
     most = _LEAST_BYTES + _MOST_RATIO * file.stat().st_size
     with file.open("rb") as stored, unpacked.open("wb") as copy, suppress(zstandard.ZstdError):
         unpacker = zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True)
@@ -204,13 +205,13 @@ def _unpack(file: Path, unpacked: Path) -> None:
 
 
 def _copy_rows(counts: Counter[str], file: Path, copy: Path) -> None:
-    """Copy what SQLite gives of a database, and count messages that are left and, if known, were stated."""
+    """Copy the readable rows of a database; count the messages left and, if known, the original number."""
     uri = file.resolve().as_uri() + "?mode=ro&immutable=1"
     with closing(sqlite3.connect(uri, uri=True)) as old, closing(sqlite3.connect(copy)) as new:
         new.execute("PRAGMA synchronous = OFF")
         old.text_factory = partial(str, encoding="utf-8", errors="replace")
-        with suppress(sqlite3.Error):  # of a header or schema that is destroyed
-            old.execute("PRAGMA writable_schema = ON")  # by which SQLite takes a file that is cut off
+        with suppress(sqlite3.Error):  # raised for a destroyed header or schema
+            old.execute("PRAGMA writable_schema = ON")  # lets SQLite open a truncated file
             for name, sql in old.execute(_TABLES).fetchall():
                 new.execute(sql)
                 ends = list[int]()
@@ -228,7 +229,7 @@ def _copy_rows(counts: Counter[str], file: Path, copy: Path) -> None:
 
 
 def _rows(base: sqlite3.Connection, table: str, last: int) -> Iterator[list[Any]]:
-    """The rows of a table up to a number, by halves of its range where SQLite fails."""
+    """Rows of a table up to row id ``last``; ranges in which SQLite fails are bisected."""
     ranges, failures = deque([(0, last)]), 0
     query = f"SELECT rowid, * FROM {table} NOT INDEXED WHERE rowid BETWEEN ? AND ?"
     while ranges:

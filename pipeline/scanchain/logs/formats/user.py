@@ -1,4 +1,4 @@
-"""Logs of a user's own format: a class that iterates over scans, which are converted to a temporary MCAP file."""
+"""Logs in a user-defined format: a class iterates over scans, which are converted to a temporary MCAP file."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ _TOPIC, _FRAME = "/points", "lidar"
 
 
 class ScanFormat(Protocol):
-    """Protocol of a class named by ``log.format``: it is made of the path of a log and iterates over its scans."""
+    """Protocol of the class named by ``log.format``: constructed from a log's path, it iterates over its scans."""
 
     def __init__(self, path: Path) -> None: ...
 
     def scans(self) -> Iterator[tuple[float, ArrayLike, ArrayLike | None]]:
-        """The scans in the order of time: stamp in seconds, points, times of the points or None.
+        """Scans in order of time: stamp in seconds, points, times of the points or None.
 
-        points : (N, 3) meters in the lidar's frame, or (N, 2) of a planar scanner; NaN where nothing came back
+        points : (N, 3) meters in the lidar's frame, or (N, 2) of a planar scanner; NaN for beams without return
         times : (N,) seconds after the stamp
         """
         ...
 
 
 def index_scans(path: Path, number: int, name: str) -> FileIndex:
-    """The scans of a path as the class ``name`` reads them, as the ``number``-th file of a log.
+    """Index of the scans that the class ``name`` reads from a path, as the ``number``-th file of a log.
 
-    Raises InputError where the class fails, or yields something else than scans.
+    Raises InputError if the class fails or yields anything other than scans.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
@@ -50,7 +50,7 @@ def index_scans(path: Path, number: int, name: str) -> FileIndex:
 
 
 def _write(log: LogWriter, path: Path, name: str) -> None:
-    """Write the scans that the class reads of a path."""
+    """Write the scans that the class reads from a path."""
     make: type[ScanFormat] = plugins.load(name, "scans")
     dimension, end = 0, object()
     with plugins.own_code(f"{path}: {name}"):
@@ -70,6 +70,6 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
             if scan.points.shape[1] != dimension:
                 raise InputError(f"points are no (N, {dimension}) as those before; yield one kind")
         rows = np.asarray(points, np.float32)
-        rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # in the plane z = 0, by which it is known as 2D
+        rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # z = 0, from which the log is recognized as 2D
         fields = {"time": np.asarray(times_s, np.float32)} if len(scan.times_s) else {}
         log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, fields)

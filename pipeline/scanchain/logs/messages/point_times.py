@@ -157,7 +157,7 @@ class PointTimes:
         self.fields = _NAMES if self.unit or config.point_times == "auto" else ()
         self.assumed = UNTIMED
         if self.by_azimuth:
-            turn = f"{config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
+            turn = f"{config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s per turn"
             self.assumed = f"point times by the azimuth: {config.point_times} from {turn} (log.point_times)"
         self.spans_s: list[float] = []
         self.periods_s: list[float] = []
