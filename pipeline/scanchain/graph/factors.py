@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scanchain import checks, lie
 from scanchain.data import Matrix, Pose
@@ -183,16 +183,15 @@ def kinds_of(
     return kind if is_loop is None else kind + is_loop
 
 
-def of_residuals(information: Matrix, freedom: int, factor: Factor) -> Matrix:
+def of_residuals(information: ArrayLike, freedom: int, factor: Factor) -> Matrix:
     """Ω (k, k) of a factor: the information (m, m) of its m residuals, padded with zeros."""
     shape = np.shape(information)
     count = shape[0] if shape else 0
     if not 0 < count <= freedom:
         wanted = f"(m, m) for the m residuals of {factor.name}, 1 to {freedom}"
         raise InputError(f"information has the shape {shape}; wanted {wanted}")
-    information = checks.matrices(information, "information", (count, count))
     result = np.zeros((freedom, freedom))
-    result[:count, :count] = information
+    result[:count, :count] = checks.matrices(information, "information", (count, count))
     return result
 
 

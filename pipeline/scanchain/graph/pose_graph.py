@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scanchain import checks, lie
 from scanchain.clock import working_s
@@ -213,7 +213,7 @@ class PoseGraph:
         self._add_edges(np.array([pair], np.int64), T_ij[None], information[None], np.array([is_loop]))
 
     def add_factor(
-        self, factor: Factor, j: int, information: Matrix, Z: Pose | None = None, i: int = ORIGIN
+        self, factor: Factor, j: int, information: ArrayLike, Z: Pose | None = None, i: int = ORIGIN
     ) -> None:
         """Add a measurement of pose j by a factor of ``scanchain.graph.factors`` or a custom one.
 
