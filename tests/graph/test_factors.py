@@ -10,7 +10,7 @@ from scanchain.config import GraphConfig
 from scanchain.data import KeyframeErrors
 from scanchain.errors import InputError
 from scanchain.evaluation.consistency import with_map_errors
-from scanchain.graph.factors import FACTORS, ORIGIN, Factor, Position, Prior
+from scanchain.graph.factors import FACTORS, ORIGIN, Factor, Odometry, Position, Prior
 from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.graph.optimization import GraphChange
 from scanchain.graph.pose_graph import PoseGraph
@@ -228,9 +228,9 @@ class Flat(Factor):
     [
         (Heading, {}, "factor is .*; wanted a Factor"),
         (Heading(), {"j": 9}, "edge -1-9 joins a pose that is not there"),
-        (Heading(), {"information": np.eye(2)}, r"Heading.error returned .*; wanted .* of the shape \(1, 2\)"),
+        (Heading(), {"information": np.eye(2)}, r"Heading.error returned .*; wanted .* of the shape \(2, 2\)"),
         (Heading(), {"information": np.eye(4)}, r"information has the shape \(4, 4\); wanted \(m, m\)"),
-        (Flat(), {}, r"Flat.error returned \[0.0\]; wanted finite numbers of the shape \(1, 1\)"),
+        (Flat(), {}, r"Flat.error returned \[0.0, 0.0\]; wanted finite numbers of the shape \(2, 1\)"),
         (Range((np.nan, 0.0), 1.0), {}, "Range.error returned"),
     ],
 )  # fmt: skip
@@ -250,3 +250,29 @@ def test_a_copy_goes_on_with_the_factors_of_the_graph():
     graph.optimize(GraphConfig())
     assert np.array_equal(copy.poses, graph.poses)
     assert isinstance(copy, PoseGraph) and replace(copy.state()).edges.min() == ORIGIN
+
+
+class Slotted(Heading):
+    __slots__ = ("yaw_rad",)
+
+    def __init__(self, yaw_rad):
+        self.yaw_rad = yaw_rad
+
+    def error(self, T_ij, Z):
+        return lie.wrap(lie.yaw(T_ij) - self.yaw_rad)[:, None]
+
+
+def test_factors_with_parameters_stay_apart_and_a_prior_far_off_is_named_in_the_certificate():
+    graph, true = drive(3)
+    graph.fix(0)
+    for k in (1, 2):
+        graph.add_factor(Slotted(0.3 * k), k, [[1e8]])
+    graph.optimize(GraphConfig())
+    assert np.allclose(lie.yaw(graph.poses[1:]), [0.3, 0.6], atol=1e-3)
+    graph, true = drive(4)
+    graph.add_factor(Prior(), 0, np.eye(3), true[0])
+    graph.add_factor(Prior(), 3, np.eye(3), true[3] @ lie.pose_2d(0.0, 0.0, 2.5))
+    graph.optimize(GraphConfig())
+    assert not graph.certify().certified
+    with pytest.raises(InputError, match="Odometry is measured from another pose; give i, or take Prior"):
+        graph.add_factor(Odometry(), 1, np.eye(3), true[1])

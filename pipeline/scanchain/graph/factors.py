@@ -23,16 +23,10 @@ class Factor:
     by ``PoseGraph.add_factor``.
 
     name : shown in messages; is_robust : whether edges have the robust loss, so that they can be rejected
-    is_bounded : whether the certificate has a lower bound of χ²
     """
 
     name: str = "factor"
     is_robust: bool = False
-    is_bounded: bool = False
-
-    def stands_for(self, other: Factor) -> bool:
-        """Whether another is of the same kind: of the same class, neither with parameters of its own."""
-        return type(self) is type(other) and not vars(self) and not vars(other)
 
     def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
         """Residuals (E, m), m up to the degrees of freedom of a pose, of relative poses (E, d+1, d+1)."""
@@ -50,9 +44,9 @@ class Factor:
 
     def check(self, T_ij: Pose, Z: Pose, count: int) -> None:
         """Raise InputError if the residuals at a pose are not ``count`` finite numbers."""
-        found = np.asarray(self.error(T_ij[None], Z[None]))
-        if found.shape != (1, count) or not np.isfinite(found).all():
-            wanted = f"finite numbers of the shape (1, {count}), as information is {count} x {count}"
+        found = np.asarray(self.error(np.stack([T_ij, T_ij]), np.stack([Z, Z])))
+        if found.shape != (2, count) or not np.isfinite(found).all():
+            wanted = f"finite numbers of the shape (2, {count}) for two poses, as information is {count} x {count}"
             raise InputError(f"{type(self).__name__}.error returned {found.tolist()}; wanted {wanted}")
 
     def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
@@ -77,8 +71,6 @@ class Factor:
 
 class Between(Factor):
     """e = log(Z⁻¹ T_i⁻¹ T_j): the right twist from the measurement to the relative pose, T_i⁻¹ T_j = Z exp(e)."""
-
-    is_bounded = True
 
     def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
         """See ``Factor``."""
@@ -118,7 +110,6 @@ class Position(Factor):
     """e = R_zᵀ(R_iᵀ(t_j − t_i) − t_z): the position of j in frame i, whatever its rotation, as in g2o."""
 
     name = "position"
-    is_bounded = True
 
     def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
         """See ``Factor``."""

@@ -27,7 +27,7 @@ from scanchain.graph.edge_checks import (
     weakly_joined,
 )
 from scanchain.graph.explanation import Explainer
-from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, ORIGIN, Factor, kinds_of, of_residuals
+from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, ORIGIN, SIGHTING, Factor, kinds_of, of_residuals
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
@@ -230,8 +230,16 @@ class PoseGraph:
         check_edges(*edge, len(self), with_origin=True)
         T_i = lie.identity(self.dimension) if i == ORIGIN else self.poses[i]
         factor.check(lie.between(T_i, self.poses[j]), Z, len(np.asarray(information)))
-        known = (kind for kind, each in enumerate(self._factors) if each is factor or each.stands_for(factor))
+        known = (
+            kind
+            for kind, each in enumerate(self._factors)
+            if each is factor or (kind < len(FACTORS) and type(each) is type(factor))
+        )
         kind = next(known, len(self._factors))
+        if i == ORIGIN and kind in (*LOOPS, ODOMETRY, SIGHTING):
+            raise InputError(
+                f"{type(factor).__name__} is measured from another pose; give i, or take Prior or Position"
+            )
         if kind == len(self._factors):
             self._factors.append(factor)
         self._extend(*edge, np.array([kind]))
@@ -404,7 +412,13 @@ class PoseGraph:
 
     def certify(self) -> Certificate:
         """Certificate of the global minimum of χ², with the edge weights of the last optimization."""
-        found = certify(self._prepared(), self._vertices, self._weight_in_force, self._undetermined(), self.names)
+        found = certify(
+            self._prepared(),
+            self._vertices,
+            self._weight_in_force,
+            self._undetermined(),
+            self._of_vertices(self.names, of_origin=ORIGIN),
+        )
         return replace(found, left_out=self.left_out)
 
     def free_poses(self) -> NDArray[np.int64]:
