@@ -276,3 +276,16 @@ def test_factors_with_parameters_stay_apart_and_a_prior_far_off_is_named_in_the_
     assert not graph.certify().certified
     with pytest.raises(InputError, match="Odometry is measured from another pose; give i, or take Prior"):
         graph.add_factor(Odometry(), 1, np.eye(3), true[1])
+
+
+def test_a_prior_is_measured_anew_from_the_origin_and_no_custom_factor_places_a_point():
+    graph, true = drive(4)
+    graph.add_factor(Prior(), 2, np.eye(3), true[3])
+    graph.remeasure(3)
+    assert np.allclose(graph.measurements[3], true[2])
+    graph.fix(0)
+    point = graph.add_point(np.array([9.0, 9.0]), 4)
+    graph.add_edge(3, point, lie.pose_2d(2.0, 0.0, 0.0), np.diag([1e4, 1e4, 0.0]))
+    graph.add_factor(Range((0.0, 0.0), float(np.linalg.norm((true[3] @ [2.0, 0.0, 1.0])[:2]))), point, [[1.0]])
+    assert graph.optimize(GraphConfig(), initialize="odometry").iterations <= 2
+    assert np.allclose(graph.poses[point, :2, 2], (true[3] @ [2.0, 0.0, 1.0])[:2])

@@ -28,7 +28,7 @@ def first_guess(
     "auto" keeps the given poses where they fit, else uses the better of them and the chordal relaxation. If there
     may be outliers it always keeps them, since the chordal relaxation is not robust to false loops.
     """
-    fixed, to_point = problem.variable < 0, np.asarray(problem.is_point[problem.edges].any(axis=1))
+    fixed, to_point = problem.variable < 0, problem.is_bounded & problem.is_point[problem.edges].any(axis=1)
     if initialize in ("odometry", "spanning-tree"):
         follow = follow_odometry if initialize == "odometry" else follow_spanning_tree
         whole = problem.is_whole

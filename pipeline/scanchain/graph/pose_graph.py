@@ -27,7 +27,17 @@ from scanchain.graph.edge_checks import (
     weakly_joined,
 )
 from scanchain.graph.explanation import Explainer
-from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, ORIGIN, SIGHTING, Factor, kinds_of, of_residuals
+from scanchain.graph.factors import (
+    FACTORS,
+    LOOP,
+    LOOP_SIGHTING,
+    ODOMETRY,
+    ORIGIN,
+    SIGHTING,
+    Factor,
+    kinds_of,
+    of_residuals,
+)  # fmt: skip
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
@@ -145,7 +155,7 @@ class PoseGraph:
     @property
     def is_loop(self) -> NDArray[np.bool_]:
         """True for every loop edge, (E,)."""
-        return (self._kind.rows == LOOPS[0]) | (self._kind.rows == LOOPS[1])
+        return (self._kind.rows == LOOP) | (self._kind.rows == LOOP_SIGHTING)
 
     @property
     def is_odometry(self) -> NDArray[np.bool_]:
@@ -236,7 +246,7 @@ class PoseGraph:
             if each is factor or (kind < len(FACTORS) and type(each) is type(factor))
         )
         kind = next(known, len(self._factors))
-        if i == ORIGIN and kind in (*LOOPS, ODOMETRY, SIGHTING):
+        if i == ORIGIN and kind in (ODOMETRY, LOOP, SIGHTING, LOOP_SIGHTING):
             raise InputError(
                 f"{type(factor).__name__} is measured from another pose; give i, or take Prior or Position"
             )
@@ -308,8 +318,8 @@ class PoseGraph:
 
     def remeasure(self, edge: int) -> None:
         """Replace the measurement of an edge by the relative pose of its ends at the current poses."""
-        measurements, (i, j) = self._measurements.rows.copy(), self.edges[edge].tolist()
-        measurements[edge] = lie.between(self.poses[i], self.poses[j])
+        measurements, (T_i, T_j) = self._measurements.rows.copy(), self._vertices[self._joined[edge]]
+        measurements[edge] = lie.between(T_i, T_j)
         self._changed()
         self._measurements.replace(measurements)
 

@@ -86,9 +86,9 @@ class GraphProblem:
     @cached_property
     def is_robust(self) -> NDArray[np.bool_]:
         """True for every edge with the robust loss, (E,)."""
-        return self._are("is_robust")
+        return np.array([factor.is_robust for factor in self.factors], np.bool_)[self.kind]
 
-    @cached_property
+    @property
     def is_bounded(self) -> NDArray[np.bool_]:
         """True for every edge for whose χ² the certificate has a lower bound, (E,)."""
         return self.kind < len(FACTORS)
@@ -112,9 +112,6 @@ class GraphProblem:
     def is_whole(self) -> NDArray[np.bool_]:
         """True for every edge that measures position and rotation, (E,)."""
         return np.isin(self.kind, WHOLE)
-
-    def _are(self, name: str) -> NDArray[np.bool_]:
-        return np.array([getattr(factor, name) for factor in self.factors], np.bool_)[self.kind]
 
     def factored(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> GraphProblem:
         """The problem of some of the edges, kept (E,), with H factored at these poses and their errors (E, k).
