@@ -10,6 +10,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import LoopsConfig
 from scanchain.data import Closure, ClosureVerdict, GraphState, Keyframe, Matrix, Pose, Problem
+from scanchain.graph.factors import edge_information
 from scanchain.graph.schedule import LAG, Schedule
 from scanchain.loops import ClosureTable, LoopCloser, PlaceTest
 from scanchain.loops.evidence import pose_by
@@ -19,7 +20,6 @@ _CONTRADICTED = Problem.plain("withdrawn: later scans contradict the location")
 _REPLACED = Problem.plain("withdrawn: more of the path matches at another location in the map")
 _ELSEWHERE = Problem.plain("contradicts the location of the log in the map, at which more of the path matches")
 _DRIFT = 0.1  # largest distance of a match from the predicted pose, as a share of the path since the last match
-LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, largest of an edge: with less information a pose is lost to rounding
 
 
 class Placement:
@@ -46,10 +46,6 @@ class Placement:
         self.rival = PlaceTest(closer.segments)  # of another location in the map, while the log has no match
         self.by_map: Closure | None = None  # the closure with the map of the newest keyframe that has one
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
-
-    def begin_in(self, count: int) -> None:
-        """Begin in a map, whose ``count`` keyframes come first and stay fixed."""
-        self.first = count
 
     @property
     def is_in_map(self) -> bool:
@@ -263,17 +259,3 @@ class Placement:
 def loop_information(closure: Closure, config: LoopsConfig) -> Matrix:
     """Information (k, k) of the pose-graph edge of a closure."""
     return edge_information(closure.match.information, config.edge_sigma_m, config.edge_sigma_rad)
-
-
-def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> Matrix:
-    """Information (k, k) of a pose-graph edge: that of the motion (k, k), with a floor under its variances.
-
-    Residuals share the map's errors and are far from independent, so that H alone is overconfident.
-    """
-    k = len(information)
-    largest = lie.by_component(k, *LARGEST_SIGMAS) ** 2
-    floor = np.minimum(lie.by_component(k, sigma_m, sigma_rad) ** 2, largest)
-    least = np.maximum(1e-6 / floor, 1.0 / largest)
-    covariance = np.linalg.inv(information + np.diag(least)) + np.diag(floor)
-    result = np.linalg.inv(covariance)
-    return 0.5 * (result + result.T)

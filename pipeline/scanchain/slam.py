@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
+from scanchain.back_end import BackEnd, Constraint
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import (
@@ -28,18 +29,15 @@ from scanchain.data import (
     brief,
 )
 from scanchain.errors import InputError, counted
+from scanchain.graph.factors import Odometry
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.schedule import Schedule
-from scanchain.loops import ClosureTable, LoopCloser, refined, spread
+from scanchain.loops import ClosureTable, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start, owned
-from scanchain.placement import LARGEST_SIGMAS, Placement, edge_information
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
 from scanchain.range_noise import RangeNoise
 from scanchain.trail import Trail
-
-_LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,34 +116,18 @@ class Slam:
         """
         config, T_start = checked_start(config, T_base_lidar, dimension)
         self.config, self.dimension = config, T_start.shape[0] - 1
-        self.is_live, self.is_finished = is_live, False
+        self.is_finished = False
         self.front_end = FrontEnd(config, T_base_lidar, self.dimension)
+        self.back_end = BackEnd(
+            config, self.dimension, prior=prior, prior_is_final=prior_is_final, is_live=is_live
+        )
+        self.trail = Trail(self.dimension, points_file, self.back_end.start_m, keeps_scans=self._refines)
         self.live_stamps = LiveStamps()
-        self.graph = PoseGraph(self.dimension)
-        self.trail = Trail(self.dimension, points_file, keeps_scans=self._refines)
-        self.closer = LoopCloser(config, self.dimension, is_live=is_live)
-        schedule = Schedule(self.graph, config.graph, config.maps.voxel_size_m)
-        self.placement = Placement(config.loops, self.closer, schedule, self.trail.keyframes)
-        if prior is not None:
-            self._begin_in(prior, prior_is_final)
 
     def __repr__(self) -> str:
-        scans = counted(len(self.trail.stamps_ns), f"{self.dimension}D scan")
+        scans = counted(len(self.trail), f"{self.dimension}D scan")
         tried = counted(len(self.closures), "closure")
         return f"{type(self).__name__}({scans}, {counted(len(self.keyframes), 'keyframe')}, {tried} tried)"
-
-    def _begin_in(self, prior: SavedMap, is_final: bool) -> None:
-        """Add the keyframes of a map as fixed nodes; where the log starts, perhaps in the map, is unknown."""
-        if prior.dimension != self.dimension:
-            raise InputError(
-                f"{prior.folder}: is a {prior.dimension}D map, the log has {self.dimension}D scans; give a map of "
-                "the same kind"
-            )
-        for keyframe in prior.keyframes:
-            self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
-        self.placement.begin_in(len(prior.keyframes))
-        traveled_m = self.closer.begin_in(prior.keyframes, prior.folder, is_final=is_final)
-        self.trail.begin_in(prior.keyframes, traveled_m)
 
     @property
     def T_base_lidar(self) -> Pose:
@@ -155,7 +137,7 @@ class Slam:
     @property
     def keyframes(self) -> list[Keyframe]:
         """All so far, those of a prior map first."""
-        return self.trail.keyframes
+        return self.back_end.keyframes
 
     @property
     def points(self) -> PointStore:
@@ -165,7 +147,7 @@ class Slam:
     @property
     def closures(self) -> ClosureTable:
         """All that were tried so far."""
-        return self.placement.closures
+        return self.back_end.placement.closures
 
     @property
     def _refines(self) -> bool:
@@ -184,7 +166,7 @@ class Slam:
 
         From the first call on, a large graph is optimized in parallel: no scan waits for it.
         """
-        self.is_live = True
+        self.back_end.is_live = True
         scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
         return self.live_stamps.passed(scan, self.process)
 
@@ -202,17 +184,13 @@ class Slam:
         tracked = located.tracked
         started = working_s()
         is_keyframe = self._add(located)
-        closures: tuple[Closure, ...] = ()
-        state = None
-        if self.config.loops.enabled:
-            closures = self.placement.close(is_keyframe=is_keyframe)
-            state = self.placement.optimize(is_live=self.is_live)
+        closures, state = self.back_end.advance(is_keyframe=is_keyframe)
         scan, seconds = tracked.scan, (tracked.preprocess_s, tracked.match_s, tracked.map_s)
         return Step(
             scan=scan,
             points=tracked.matched,
             T_odom_lidar=tracked.T_odom_lidar,
-            T_world_lidar=self.placement.T_world_odom @ tracked.T_odom_lidar,
+            T_world_lidar=self.back_end.placement.T_world_odom @ tracked.T_odom_lidar,
             match=tracked.match,
             state=tracked.state,
             reason=tracked.reason,
@@ -231,44 +209,38 @@ class Slam:
         Raises InputError if no scan was processed, and when called again.
         """
         self._check_unfinished()
-        trail, first = self.trail, self.trail.first
-        if not len(trail.stamps_ns):
+        if not len(self.trail):
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         self.is_finished = True
-        if self.config.loops.enabled:
-            progress("closing the last loops")
-            self.placement.finish()
-        progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
-        state = self.placement.schedule.finish()
-        if self.placement.set_apart():
-            state = self.graph.state()
-        odometry, scan_of = trail.odometry, trail.scan_of
-        starts = [start - first for start in self.closer.segments.starts]
+        back_end, odometry = self.back_end, self.trail.odometry
+        state, first = back_end.finish(progress), back_end.first
+        scan_of = np.array([keyframe.scan_index for keyframe in self.keyframes[first:]])
+        starts = [start - first for start in back_end.closer.segments.starts]
         corrected = spread(state.poses[first:], scan_of, odometry.poses, starts)
         if self._refines:
             progress(f"refining {counted(len(odometry), 'scan')}")
             fixed, poses = self.keyframes[:first], corrected[scan_of]
             world = (fixed, state.poses[:first]) if fixed else (self.keyframes, poses)
-            corrected = refined(corrected, trail.spans.rows, trail.points, *world, self.config)
-        tracking, rival = self.front_end.odometry, self.placement.rival
+            corrected = refined(corrected, self.trail.points_of, *world, self.config)
+        tracking, placement = self.front_end.odometry, back_end.placement
         return SlamResult(
             trajectory=Trajectory(odometry.stamps_ns, corrected),
             odometry=odometry,
             keyframes=tuple(self.keyframes),
             closures=self.closures,
-            graph=self.graph,
+            graph=back_end.graph,
             state=state,
-            components=self.closer.segments.components(self.graph),
-            map_errors=tuple(trail.map_errors),
+            components=back_end.closer.segments.components(back_end.graph),
+            map_errors=tuple(back_end.errors),
             warnings=tracking.predictor.warnings(),
             mounting_note=tracking.predictor.mounting.finish(),
             T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,
             calibrated_from=tracking.calibrated_from,
-            map_log_odds=self.placement.evidence.best if first else math.nan,
-            map_rival_log_odds=rival.log_odds if rival.is_accepted else math.nan,
-            map_alike_share=self.closer.alike_share,
+            map_log_odds=placement.evidence.best if first else math.nan,
+            map_rival_log_odds=placement.rival.log_odds if placement.rival.is_accepted else math.nan,
+            map_alike_share=back_end.closer.alike_share,
             noise=tracking.resolution.noise,
         )
 
@@ -277,25 +249,27 @@ class Slam:
             raise InputError("Slam.finish was called: its result is whole; begin another Slam for further scans")
 
     def _add(self, located: Located) -> bool:
-        """Add a scan; True if it is a keyframe, which is then joined to the last one in the graph."""
-        if not self.trail.add(located):
+        """Add a scan; True if it is a keyframe, which the motion from the last one joins to the graph."""
+        if len(self.trail) == 1:  # only now is the motion known that distorted the first scan
+            stored = self.trail.replace_first(located.first_points)
+            self.back_end.replace_points(self.back_end.first, stored)
+        stored = self.trail.add(located)
+        if not located.is_keyframe or stored is None:
             return False
-        newest, config, tracked = self.keyframes[-1], self.config.odometry, located.tracked
-        if newest.index == 0:
-            self.graph.add_pose(self.placement.T_world_odom @ newest.T_odom_lidar, newest.stamp_ns)
-            return True
-        last = self.keyframes[-2]
-        T_world = self.placement.predict(last.T_odom_lidar, newest.T_odom_lidar)
-        self.graph.add_pose(T_world, newest.stamp_ns)
-        lost = self.trail.lost_before
-        sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
-        if lost:
-            sigmas = (lost * _LOST_SIGMAS[0], lost * _LOST_SIGMAS[1])
-        elsewhere_m = tracked.elsewhere_m if newest.index > self.trail.first else LARGEST_SIGMAS[0]
-        if elsewhere_m > 0.0:
-            sigmas = (elsewhere_m, np.pi)
-            self.placement.start_segment(newest.index)
-        information = edge_information(located.information, *sigmas)
-        T_last_newest = lie.between(last.T_odom_lidar, newest.T_odom_lidar)
-        self.graph.add_edge(last.index, newest.index, T_last_newest, information)
+        tracked, number = located.tracked, len(self.keyframes)
+        keyframe = Keyframe(
+            index=number,
+            scan_index=len(self.trail) - 1,
+            stamp_ns=tracked.scan.stamp_ns,
+            stored=stored,
+            T_odom_lidar=tracked.T_odom_lidar,
+            traveled_m=self.trail.traveled_m,
+            scale=located.scale,
+            noise_m=located.noise_m,
+        )
+        motion: list[Constraint] = []
+        if keyframe.scan_index:
+            Z = lie.between(self.keyframes[-1].T_odom_lidar, keyframe.T_odom_lidar)
+            motion.append(Constraint(Odometry(), number - 1, Z, located.information))
+        self.back_end.add(keyframe, motion, located.errors, starts_segment=tracked.elsewhere_m > 0.0)
         return True

@@ -53,11 +53,11 @@ def outcome(log: Log, scans: list[Scan], T: Matrix, first: range, second: range)
         slam.process(replace(scans[number], T_odom_base=None))
         if number > second.start and away_m[number] < IN_SIGHT_M:
             in_sight_m += float(np.linalg.norm(positions[number] - positions[number - 1]))
-        components = slam.closer.segments.components(slam.graph, with_assumed=False)
+        components = slam.back_end.closer.segments.components(slam.back_end.graph, with_assumed=False)
         if np.isnan(after_m) and number in second and components[-1] == components[0]:
             after_m = in_sight_m
     result = slam.finish()
-    if len(slam.closer.segments.starts) == 1:
+    if len(slam.back_end.closer.segments.starts) == 1:
         return "bridged", in_sight_m, after_m
     if result.components[-1] != result.components[0]:
         return "apart", in_sight_m, after_m

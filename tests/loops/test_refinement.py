@@ -28,13 +28,12 @@ def seen_in_room(T, length_m=6.0, width_m=4.0, reach_m=np.inf):
 
 
 def drive(**room):
-    """Twenty true poses in a room, the store and spans of their scans, and every fifth as a keyframe."""
+    """Twenty true poses in a room, the points of their scans, and every fifth as a keyframe."""
     truth = np.array([lie.pose_2d(0.1 * k - 1.0, 0.03 * k, 0.05 * k) for k in range(20)])
     store = PointStore(2)
     stored = [store.add(seen_in_room(T, **room)) for T in truth]
-    spans = np.array([(each.first, each.count) for each in stored])
     keyframes = [Keyframe(k // 5, k, k, stored[k], truth[k], 0.1 * k) for k in range(0, 20, 5)]
-    return truth, store, spans, keyframes
+    return truth, [each.read() for each in stored], keyframes
 
 
 def shaken(truth, sigma_m, sigma_rad, seed=0):
@@ -49,39 +48,39 @@ def error_m(poses, truth):
 
 
 def test_scans_find_the_place_that_the_keyframes_give_them():
-    truth, store, spans, keyframes = drive()
+    truth, scans, keyframes = drive()
     poses = shaken(truth, 0.03, 0.005)
-    after = refined(poses, spans, store, keyframes, poses[::5], configured(2))
+    after = refined(poses, scans.__getitem__, keyframes, poses[::5], configured(2))
     assert error_m(after, truth) < 0.3 * error_m(poses, truth)
 
 
 def test_a_scan_stays_where_the_map_tells_nothing():
-    truth, store, spans, keyframes = drive(length_m=100.0, reach_m=10.0)
+    truth, scans, keyframes = drive(length_m=100.0, reach_m=10.0)
     poses = truth.copy()
     poses[7] = truth[7] @ lie.pose_2d(0.0, 0.03, 0.0)
     poses[8] = lie.pose_2d(0.03, 0.0, 0.0) @ truth[8]
-    after = refined(poses, spans, store, keyframes, poses[::5], configured(2))
+    after = refined(poses, scans.__getitem__, keyframes, poses[::5], configured(2))
     assert abs(after[7, 1, 2] - truth[7, 1, 2]) < 0.005
     assert abs(after[8, 0, 2] - poses[8, 0, 2]) < 0.5 * 0.03
 
 
 def test_a_scan_without_points_or_far_from_everything_stays():
-    truth, store, spans, keyframes = drive()
-    spans[3, 1] = 0
+    truth, scans, keyframes = drive()
+    scans[3] = np.empty((0, 2))
     poses = truth.copy()
     poses[4] = lie.pose_2d(50.0, 50.0, 1.0)
-    after = refined(poses, spans, store, keyframes, poses[::5], configured(2))
+    after = refined(poses, scans.__getitem__, keyframes, poses[::5], configured(2))
     assert np.array_equal(after[3:5], poses[3:5])
 
 
 @pytest.mark.parametrize("least_share", [0.3, 1.0])
 def test_the_kernel_is_one_alignment_after_the_other(least_share):
-    truth, store, spans, keyframes = drive()
+    truth, scans, keyframes = drive()
     config = configured(2)
     surfaces = VoxelMap(2, config.local_map)
     for keyframe in keyframes:
         surfaces.insert(keyframe.points, truth[keyframe.scan_index])
-    points, starts = store.read(0, store.rows).astype(float), np.append(0, np.cumsum(spans[:, 1]))
+    points, starts = np.concatenate(scans), np.cumsum([0, *map(len, scans)])
     prior, terms = np.diag([2.0, 2.0, 40.0]), settings_of(config.matching, surfaces, wide=False)
     fast = shaken(truth, 0.05, 0.02)
     slow = fast.copy()

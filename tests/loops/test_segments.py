@@ -8,6 +8,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Proposal
+from scanchain.graph.factors import edge_information
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.loops.connectivity import Segments
@@ -16,7 +17,6 @@ from scanchain.loops.evidence import PlaceTest
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.odometry import Odometry
 from scanchain.odometry.odometry import first_match
-from scanchain.placement import edge_information
 from scanchain.runs.closures import final_verdicts
 from scanchain.slam import Slam
 from tests.benchmarks.harness import ate_m
@@ -244,14 +244,15 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
     slam = Slam(configured(2), log.T_base_lidar)
     holed, starts = carried(slam, scans, 4000, 4600)
     before, after = (ate_m(trajectory, whole.trajectory) for trajectory in (holed.odometry, holed.trajectory))
-    assert len(slam.closer.segments.starts) == 2
+    assert len(slam.back_end.closer.segments.starts) == 2
     assert none == [] and starts == [4600]
     assert before > 5.0
     assert after < 0.5
     across = [
         item.proposed_by
         for item in final_verdicts(holed.closures, holed.state)
-        if item.verdict is ClosureVerdict.ACCEPTED and item.target < slam.closer.segments.starts[1] <= item.source
+        if item.verdict is ClosureVerdict.ACCEPTED
+        and item.target < slam.back_end.closer.segments.starts[1] <= item.source
     ]
     assert len(across) > 10
 

@@ -181,11 +181,11 @@ def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monke
     broken = Slam(config, log.T_base_lidar, tmp_path / POINTS_FILE, is_live=True)
     breaks = 0
     for scan in log.scans():
-        was_in_background = broken.placement.schedule.background is not None
+        was_in_background = broken.back_end.placement.schedule.background is not None
         a, b = straight.process(scan), broken.process(scan)
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
         assert (a.graph is None) == (b.graph is None)
-        if broken.placement.schedule.background is not None and not was_in_background:
+        if broken.back_end.placement.schedule.background is not None and not was_in_background:
             breaks += 1
             broken = killing.taken_up(broken, tmp_path)
     assert breaks > 0

@@ -69,7 +69,7 @@ def false_closures(slam, share, seed=0):
     while len(wrong) < share / (1.0 - share) * len(true):
         target, source = np.sort(rng.choice(len(slam.keyframes), 2, replace=False))
         model = true[rng.integers(len(true))]
-        here = slam.graph.poses[target] @ model.match.T_target_source
-        if np.linalg.norm((here - slam.graph.poses[source])[:-1, -1]) > 1.0:
+        here = slam.back_end.graph.poses[target] @ model.match.T_target_source
+        if np.linalg.norm((here - slam.back_end.graph.poses[source])[:-1, -1]) > 1.0:
             wrong.append(replace(model, target=int(target), source=int(source), reason=MADE_UP))
     return tuple(wrong)

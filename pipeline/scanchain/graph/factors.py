@@ -13,6 +13,7 @@ from scanchain.errors import InputError
 from scanchain.kernels.graph import between
 
 ORIGIN = -1  # index i of a unary edge: the origin of the world, which is fixed
+LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, largest of an edge: with less information a pose is lost to rounding
 _STEP = 1e-6  # m or rad, step of central differences: of the order of the cube root of machine epsilon
 
 
@@ -184,6 +185,20 @@ def of_residuals(information: ArrayLike, freedom: int, factor: Factor) -> Matrix
     result = np.zeros((freedom, freedom))
     result[:count, :count] = checks.matrices(information, "information", (count, count))
     return result
+
+
+def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> Matrix:
+    """Information (k, k) of a pose-graph edge: that of the motion (k, k), with a floor under its variances.
+
+    Residuals share the map's errors and are far from independent, so that H alone is overconfident.
+    """
+    k = len(information)
+    largest = lie.by_component(k, *LARGEST_SIGMAS) ** 2
+    floor = np.minimum(lie.by_component(k, sigma_m, sigma_rad) ** 2, largest)
+    least = np.maximum(1e-6 / floor, 1.0 / largest)
+    covariance = np.linalg.inv(information + np.diag(least)) + np.diag(floor)
+    result = np.linalg.inv(covariance)
+    return 0.5 * (result + result.T)
 
 
 def turns(positions: Matrix) -> Matrix:

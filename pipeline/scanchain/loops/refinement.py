@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from math import inf
 
@@ -14,7 +14,6 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points
 from scanchain.kernels.registration.icp import refine
-from scanchain.point_store import PointStore
 from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
 from scanchain.threads import threads
@@ -45,8 +44,7 @@ def spread(
 
 def refined(
     poses: Matrix,
-    spans: NDArray[np.int64],
-    store: PointStore,
+    points_of: Callable[[int], Points],
     keyframes: Sequence[Keyframe],
     T_world_keyframes: Matrix,
     config: Config,
@@ -54,7 +52,7 @@ def refined(
     """T_world_lidar (N, 3, 3) of all scans, each aligned once more to the map of all keyframes.
 
     In directions that the map does not constrain, a prior as uncertain as an odometry edge keeps a pose unchanged.
-    spans : (N, 2) first row and number of each scan's points in the store
+    points_of : the points (M, 2) of a scan by its number
     keyframes, T_world_keyframes : of the map
     """
     T_world_keyframes, result = T_world_keyframes.copy(), poses.copy()
@@ -67,24 +65,19 @@ def refined(
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
     prior = np.diag(sigma**-2.0) * settings.variance
 
-    def refine_part(part: slice, points: Points) -> None:
-        starts = np.append(0, np.cumsum(spans[part, 1]))
+    def refine_part(part: slice, clouds: list[Points]) -> None:
+        starts = np.cumsum([0, *map(len, clouds)])
+        points = np.concatenate([np.empty((0, 2)), *clouds], dtype=np.float64)
         refine(surfaces.voxels, points, starts, result[part], prior, least_share, settings)
 
     count = threads()
     with ThreadPoolExecutor(count) as pool:  # scans are independent, and kernels release the GIL
         for first in range(0, len(poses), count * _MAX_SCANS):
             parts = [slice(first + k * _MAX_SCANS, first + (k + 1) * _MAX_SCANS) for k in range(count)]
-            clouds = [_points_of(spans[part], store) for part in parts]
+            clouds = [[points_of(scan) for scan in range(*part.indices(len(poses)))] for part in parts]
             list(pool.map(refine_part, parts, clouds))
     result[:, :2, 2] += origin_m
     return result
-
-
-def _points_of(spans: NDArray[np.int64], store: PointStore) -> Points:
-    """The points of scans, one after the other, (N, 2)."""
-    scans = [store.read(row, count) for row, count in spans.tolist()]
-    return np.concatenate([np.empty((0, 2)), *scans], dtype=np.float64)
 
 
 def _map_of(T_world_keyframes: Matrix, keyframes: Sequence[Keyframe], config: Config) -> VoxelMap:

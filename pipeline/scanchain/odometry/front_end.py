@@ -8,10 +8,12 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, Scan, State
+from scanchain.graph.factors import edge_information
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.odometry.odometry import Odometry, Tracked
 from scanchain.preprocess import Prepared
 
+_LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 _LATEST = 0.1  # weight of the last scan in the mean of the systematic errors
 
 
@@ -20,7 +22,7 @@ class Located(msgspec.Struct, frozen=True):
 
     ``scale`` is that of its voxels, without the factor for dense scans;
     ``local_map`` (L, d) is its map, odom frame, empty unless ``is_keyframe``;
-    ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame, zero unless
+    ``information`` (k, k) is that of the edge from the last keyframe, a twist in its own frame, zero unless
     ``is_keyframe``;
     ``errors`` are those of the pose of the last keyframe, this scan included, against the map;
     ``first_points`` (M, d) are those of the first scan, deskewed once the second one gives its velocity;
@@ -52,6 +54,7 @@ class FrontEnd:
         self.errors = KeyframeErrors(1.0, self.nothing, 0.0)  # of the last keyframe
         self.has_wheels = False
         self.since_keyframe = 0
+        self.lost = 0  # number of scans lost since the keyframe
         self.scans = 0
         self.no_points = np.empty((0, self.odometry.dimension))
         self.information = self.nothing  # of the motion since the keyframe
@@ -64,23 +67,35 @@ class FrontEnd:
         has_moved = is_far and tracked.state is not State.LOST
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or has_moved
         self.scans += 1
+        self.lost += tracked.state is State.LOST
         if not tracked.is_repeated:
             self.information = self._since(tracked)
             self.error_tracker.take(tracked)
+        information = self.nothing
         if is_keyframe:
+            information = self._of_edge(tracked)
             self.errors = self.error_tracker.at_keyframe(tracked, self.T_odom_keyframe)
             self.T_odom_keyframe = tracked.T_odom_lidar
-            self.covariance, self.inflation, self.since_keyframe = self.nothing, self.nothing, 0
+            self.covariance, self.inflation, self.since_keyframe, self.lost = self.nothing, self.nothing, 0, 0
         return Located(
             tracked=tracked,
             is_keyframe=is_keyframe,
             scale=self.odometry.resolution.octave,
             local_map=self.odometry.local_map.points() if is_keyframe else self.no_points,
-            information=self.information if is_keyframe else self.nothing,
+            information=information,
             errors=self.errors,
             first_points=self.odometry.first_points,
             noise_m=self.odometry.noise_m,
         )
+
+    def _of_edge(self, tracked: Tracked) -> Matrix:
+        """Information (k, k) of the edge from the last keyframe to this one, with a floor under its variances."""
+        sigmas = self.config.edge_sigma_m, self.config.edge_sigma_rad
+        if self.lost:
+            sigmas = self.lost * _LOST_SIGMAS[0], self.lost * _LOST_SIGMAS[1]
+        if tracked.elsewhere_m > 0.0:
+            sigmas = tracked.elsewhere_m, np.pi
+        return edge_information(self.information, *sigmas)
 
     def _since(self, tracked: Tracked) -> Matrix:
         """Information (k, k) of the motion since the last keyframe, from the match and all predictions since.

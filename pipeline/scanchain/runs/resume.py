@@ -253,7 +253,9 @@ def resume_recording(folder: Path, left: Checkpoint, recording: Recorder, checkp
     is_whole = 0 < left.recorded_bytes <= (before.stat().st_size if before.exists() else 0)
     if is_whole:
         os.truncate(before, left.recorded_bytes)
-    recording.resume(before if is_whole else None, left.steps, left.slam.closures, left.slam.graph.state())
+    recording.resume(
+        before if is_whole else None, left.steps, left.slam.closures, left.slam.back_end.graph.state()
+    )
     recorded_bytes = recording.secure()
     checkpoints.write(left.slam, left.steps, recorded_bytes)
     note = f"resumed after {counted(len(left.steps), 'scan')}"

@@ -1,4 +1,4 @@
-"""Alignment of a map to another: its keyframes pass through the SLAM chain like scans of a log in ``localize``."""
+"""Alignment of a map to another: its keyframes enter the back end like those of a log in ``localize``."""
 
 from __future__ import annotations
 
@@ -12,25 +12,13 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
+from scanchain.back_end import BackEnd, Constraint
 from scanchain.config import Config
-from scanchain.data import (
-    Closure,
-    ClosureVerdict,
-    Keyframe,
-    KeyframeErrors,
-    Matrix,
-    Points,
-    Pose,
-    Prior,
-    RawPoints,
-    Scan,
-    State,
-)
+from scanchain.data import Closure, ClosureVerdict, Keyframe, KeyframeErrors, Matrix, Pose
 from scanchain.errors import InputError, counted
+from scanchain.graph.factors import Odometry, edge_information
+from scanchain.loops import refined
 from scanchain.maps import Edges, SavedMap, open_saved_map
-from scanchain.odometry.front_end import Located
-from scanchain.odometry.odometry import Tracked, first_match
-from scanchain.slam import Slam
 
 _LATE = 10  # least number of keyframes before the first matched one for which these are matched backward, too
 _FOUND = 0.5, 0.05  # m and rad, standard deviations of the pose that they start from
@@ -128,30 +116,43 @@ def _walked(
     config, is_final : as of ``align``, except that no loop is closed within the path
     T_target_first : pose of the first of them, where it is known
     """
-    slam = Slam(config, dimension=target.dimension, prior=target, prior_is_final=is_final)
-    information, first_points = _information(keyframes, edges, order, config), keyframes[order[0]].points
+    back_end, old = BackEnd(config, target.dimension, prior=target, prior_is_final=is_final), len(target.keyframes)
+    information, traveled_m = _information(keyframes, edges, order, config), back_end.start_m
+    motion: list[Constraint] = []
+    errors = KeyframeErrors(1.0, np.zeros_like(information[0]), 0.0)
     for n, number in enumerate(order):
-        slam.place(_located(keyframes[number], information[n], first_points, config))
+        if n:
+            T_last, T_next = back_end.keyframes[-1].T_odom_lidar, keyframes[number].T_odom_lidar
+            traveled_m += lie.apart(T_last, T_next)[0]
+            motion = [Constraint(Odometry(), old + n - 1, lie.between(T_last, T_next), information[n])]
+        keyframe = replace(keyframes[number], index=old + n, scan_index=n, traveled_m=traveled_m, noise_m=0.0)
+        back_end.add(keyframe, motion, errors)
+        back_end.advance(is_keyframe=True)
         if n == 0 and T_target_first is not None:
-            slam.placement.begin_at(T_target_first, _FOUND)
-    result, old = slam.finish(), len(target.keyframes)
-    i, j = result.state.edges[result.state.is_loop & ~result.state.is_rejected].T
+            back_end.placement.begin_at(T_target_first, _FOUND)
+    state = back_end.finish()
+    placed, segments = state.poses[old:], back_end.closer.segments.components(back_end.graph)
+    if target.dimension == 2 and config.loops.refine:
+        path = back_end.keyframes[old:]
+        placed = refined(placed, lambda n: path[n].points, target.keyframes, state.poses[:old], config)
+    i, j = state.edges[state.is_loop & ~state.is_rejected].T
     loops = int(((i < old) & (j >= old)).sum())
-    is_found = loops > 0 and result.components[0] == result.components[-1]
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-    poses[list(order)] = result.trajectory.poses
-    closures = (replace(c, source=old + order[c.source - old]) for c in result.closures if c.target < old)
-    return Alignment(poses, tuple(closures), loops, bool(is_found))
+    poses[list(order)] = placed
+    closures = (
+        replace(c, source=old + order[c.source - old]) for c in back_end.placement.closures if c.target < old
+    )
+    return Alignment(poses, tuple(closures), loops, bool(loops and segments[0] == segments[-1]))
 
 
 def _information(keyframes: Sequence[Keyframe], edges: Edges, order: Sequence[int], config: Config) -> Matrix:
-    """(N, k, k) of the motion to each keyframe from the one before in this order, by the edge between them if any.
+    """(N, k, k) of an edge to each keyframe from the one before in this order: that of the map if there is one.
 
     T_ji = T_ij⁻¹: where the order is against the path, a twist ξ on it is one of −Ad(T_ji) ξ on T_ij.
     """
     k = lie.twist_size(keyframes[0].T_odom_lidar)
-    usual = lie.by_component(k, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad) ** -2.0
-    result = np.tile(np.diag(usual), (len(order), 1, 1))
+    sigmas = config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad
+    result = np.tile(np.diag(lie.by_component(k, *sigmas) ** -2.0), (len(order), 1, 1))
     odometry = edges.where(~edges.is_loop)
     known = dict(zip(map(tuple, odometry.pairs.tolist()), odometry.information, strict=True))
     for n, (i, j) in enumerate(pairwise(order), 1):
@@ -159,17 +160,5 @@ def _information(keyframes: Sequence[Keyframe], edges: Edges, order: Sequence[in
         if (j, i) in known:
             Ad = lie.adjoint(lie.between(keyframes[i].T_odom_lidar, keyframes[j].T_odom_lidar))
             result[n] = Ad.T @ known[j, i] @ Ad
+        result[n] = edge_information(result[n], *sigmas)
     return result
-
-
-def _located(keyframe: Keyframe, information: Matrix, first_points: Points, config: Config) -> Located:
-    """A keyframe of a map as odometry would output it, with its final pose in place of that of odometry."""
-    points, T = keyframe.points, keyframe.T_odom_lidar
-    raw: RawPoints = points.astype(np.float32)
-    scan = Scan(keyframe.scan_index, keyframe.stamp_ns, keyframe.stamp_ns, raw, np.empty(0, np.float32), 0, None)
-    match = first_match(T, points, config.matching)
-    covariance = np.linalg.inv(information).astype(np.float64)
-    prior = Prior(T, covariance, np.zeros(len(information)))
-    tracked = Tracked(scan, points, points, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
-    errors = KeyframeErrors(1.0, np.zeros_like(information), 0.0)
-    return Located(tracked, True, keyframe.scale, points[:0], information, errors, first_points)

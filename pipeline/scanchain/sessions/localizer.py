@@ -124,7 +124,7 @@ class Localizer:
         self.live: list[Pose] = []
         self.sigma_m: list[float] = []
         self.traveled_m: list[float] = []
-        self.start_m = self.slam.trail.traveled_m
+        self.start_m = self.slam.back_end.start_m
         self.is_in_map = False
         self.state = MapState.SEARCHING  # of the newest keyframe
         self.covariance = np.empty((0, 0))  # of its pose without its own error, once it is in the map
@@ -156,7 +156,7 @@ class Localizer:
         """Localize one scan of a log."""
         step = self.slam.process(scan)
         if self.initial is not None and len(self.states) == 0:
-            self.slam.placement.begin_at(self.initial, INITIAL_SIGMAS)
+            self.slam.back_end.placement.begin_at(self.initial, INITIAL_SIGMAS)
         placed = self._placed(step)
         T, covariance = placed.T_map_lidar, placed.covariance
         variances = [np.nan] if covariance is None else covariance.diagonal()[: self.slam.dimension].tolist()
@@ -168,7 +168,7 @@ class Localizer:
 
     def finish(self) -> Localization:
         """Complete matching and smooth the whole path; scans from before the log was found are placed, too."""
-        result, first = self.slam.finish(), self.slam.trail.first
+        result, first = self.slam.finish(), self.slam.back_end.first
         scans = [keyframe.scan_index for keyframe in result.keyframes[first:]]
         keyframe_of = np.searchsorted(scans, np.arange(len(result.trajectory)), side="right") - 1
         is_placed = (result.components[first:] == result.components[0])[keyframe_of]
@@ -190,43 +190,44 @@ class Localizer:
         )
 
     def _placed(self, step: Step) -> Placed:
-        slam = self.slam
+        placement = self.slam.back_end.placement
         if step.closures or step.graph is not None or step.starts_segment or not self.states:
-            self.is_in_map = slam.placement.is_in_map
+            self.is_in_map = placement.is_in_map
         if not self.is_in_map:
             self.covariance = np.empty((0, 0))
             return Placed(MapState.SEARCHING, None, None, step)
         if step.keyframe >= 0 or not len(self.covariance):
             self._follow()
-        T_map_lidar = slam.placement.T_world_odom @ step.T_odom_lidar
-        covariance = _moved(self.covariance, slam.keyframes[-1], step.T_odom_lidar) + self.own
+        T_map_lidar = placement.T_world_odom @ step.T_odom_lidar
+        covariance = _moved(self.covariance, self.slam.keyframes[-1], step.T_odom_lidar) + self.own
         return Placed(MapState.LOST if step.state is State.LOST else self.state, T_map_lidar, covariance, step)
 
     def _follow(self) -> None:
         """State and covariance of the newest keyframe: by its match with the map, or by the motion to it."""
-        slam, by_map, newest = self.slam, self.slam.placement.by_map, self.slam.keyframes[-1]
-        of_newest = (slam.graph.edges[:, 1] == newest.index) & slam.graph.is_odometry
-        information = slam.graph.added_since(int(np.flatnonzero(of_newest)[-1]))[1][:1]
+        back_end, by_map = self.slam.back_end, self.slam.back_end.placement.by_map
+        graph, keyframes, newest = back_end.graph, back_end.keyframes, back_end.keyframes[-1]
+        of_newest = (graph.edges[:, 1] == newest.index) & graph.is_odometry
+        information = graph.added_since(int(np.flatnonzero(of_newest)[-1]))[1][:1]
         motion, own = self._errors(information, newest.index, is_loop=False)
         if by_map is not None and (by_map is not self.by_map or not len(self.covariance)):
-            loop = loop_information(by_map, slam.config.loops)[None]
+            loop = loop_information(by_map, back_end.config.loops)[None]
             matched = self._errors(loop, by_map.source, is_loop=True)[0]
-            self.covariance = _moved(matched, slam.keyframes[by_map.source], newest.T_odom_lidar)
+            self.covariance = _moved(matched, keyframes[by_map.source], newest.T_odom_lidar)
         elif by_map is None and not len(self.covariance):
-            self.covariance = np.diag(lie.by_component(slam.graph.freedom, *INITIAL_SIGMAS) ** 2)
+            self.covariance = np.diag(lie.by_component(graph.freedom, *INITIAL_SIGMAS) ** 2)
         else:
-            self.covariance = _moved(self.covariance, slam.keyframes[-2], newest.T_odom_lidar) + motion
+            self.covariance = _moved(self.covariance, keyframes[-2], newest.T_odom_lidar) + motion
         self.by_map, self.own = by_map, own
         if by_map is not None and newest.index - by_map.source <= _RECENT_KEYFRAMES:
             self.state = MapState.LOCALIZED
         else:
-            placed = replace(newest, T_odom_lidar=slam.graph.poses[-1])
-            is_known = is_in_sight(placed, slam.keyframes[: slam.trail.first])
+            placed = replace(newest, T_odom_lidar=graph.poses[-1])
+            is_known = is_in_sight(placed, keyframes[: back_end.first])
             self.state = MapState.UNMATCHED if is_known else MapState.OUTSIDE
 
     def _errors(self, information: Matrix, keyframe: int, *, is_loop: bool) -> tuple[Matrix, Matrix]:
         """Covariances (k, k) of an edge to a keyframe, and of that keyframe's own pose error."""
-        errors = self.slam.trail.map_errors[keyframe : keyframe + 1]
+        errors = self.slam.back_end.errors[keyframe : keyframe + 1]
         edge, own = edge_errors(information, np.array([is_loop]), errors, self.slam.config)
         return edge[0], own[0]
 

@@ -22,7 +22,6 @@ from scanchain.errors import InputError
 from scanchain.graph.g2o import write_g2o
 from scanchain.loops import refined, spread
 from scanchain.maps import SavedMap, write_map, write_ply, write_saved_map
-from scanchain.point_store import PointStore
 from scanchain.runs.closures import final_verdicts, write_closures
 from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
 from scanchain.sessions.changes import Label, Part, changes_between
@@ -134,11 +133,12 @@ def _refined(joined: Joined, config: Config, held: int) -> Matrix:
     poses = joined.poses
     if joined.dimension == 3 or not config.loops.refine:
         return poses
-    store = PointStore(2)
-    stored = [store.add(keyframe.points) for keyframe in joined.keyframes]
-    spans = np.array([(each.first, each.count) for each in stored], np.int64)
-    free = joined.of_map != held
-    poses[free] = refined(poses[free], spans[free], store, joined.keyframes, joined.poses, config)
+    free = np.flatnonzero(joined.of_map != held)
+
+    def points_of(n):
+        return joined.keyframes[free[n]].points
+
+    poses[free] = refined(poses[free], points_of, joined.keyframes, joined.poses, config)
     return poses
 
 
