@@ -22,7 +22,7 @@ def test_odometry_of_arrays_is_that_of_the_log_bit_by_bit():
     for scan in scans:
         stamp_s = scan.stamp_ns * 1e-9
         again = scan.__class__.of(scan.points, stamp_s, scan.times_s, index=scan.index)
-        tracked = live.track(scan.points, stamp_s, scan.times_s)
+        tracked = live.process(sc.Scan.of(scan.points, stamp_s, scan.times_s))
         assert np.array_equal(tracked.T_odom_lidar, of_log.process(again).T_odom_lidar)
     assert tracked.T_odom_lidar[0, 3] > 5.0
     assert tracked.state is sc.State.OK
@@ -100,7 +100,7 @@ def test_errors_of_calls_name_arguments_of_the_call(office, tmp_path):
 def test_slam_of_arrays_places_every_scan():
     scans = list(islice(sc.open_log(shared_data("2d/mit_csail.mcap")).scans(), 120))
     slam = sc.Slam(dimension=2)
-    steps = [slam.track(scan.points, scan.stamp_ns * 1e-9) for scan in scans]
+    steps = [slam.process(sc.Scan.of(scan.points, scan.stamp_ns * 1e-9)) for scan in scans]
     result = slam.finish()
     assert [step.scan.index for step in steps] == list(range(120))
     assert len(result.trajectory) == 120
@@ -143,8 +143,8 @@ def test_invalid_returns_of_an_organized_cloud_are_dropped_with_their_times_and_
         points[rows] = scan.points
         if len(scan.times_s):
             times_s[rows] = scan.times_s
-        wanted = whole.track(scan.points, stamp_s, scan.times_s)
-        tracked = organized.track(points, stamp_s, times_s if len(scan.times_s) else None)
+        wanted = whole.process(sc.Scan.of(scan.points, stamp_s, scan.times_s))
+        tracked = organized.process(sc.Scan.of(points, stamp_s, times_s if len(scan.times_s) else None))
         assert tracked.scan.dropped == count and len(tracked.scan.points) == count
         assert np.array_equal(tracked.T_odom_lidar, wanted.T_odom_lidar)
     assert np.array_equal(sc.downsample(points, 1.0), sc.downsample(scan.points, 1.0))
@@ -160,7 +160,7 @@ def live(stamps_s, span_s=0.0, kind=sc.Odometry):
     """What was given a scan at each of these stamps, its points measured over so many seconds."""
     made = kind()
     for stamp_s in stamps_s:
-        made.track(ROOM, stamp_s, np.linspace(0.0, span_s, len(ROOM)) if span_s else None)
+        made.process(sc.Scan.of(ROOM, stamp_s, np.linspace(0.0, span_s, len(ROOM)) if span_s else None))
     return made
 
 
@@ -202,8 +202,8 @@ def test_a_scan_that_was_refused_is_forgotten():
     odometry = live([0.0, 0.1])
     for _ in range(2):
         with pytest.raises(InputError, match="wanted seconds that increase"):
-            odometry.track(ROOM, 0.1)
-    assert odometry.track(ROOM, 0.2).scan.index == 2
+            odometry.process(sc.Scan.of(ROOM, 0.1))
+    assert odometry.process(sc.Scan.of(ROOM, 0.2)).scan.index == 2
 
 
 def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from scanchain import checks
 from scanchain import slam as core
 from scanchain.config import Config
-from scanchain.data import AnyPoints, Points, Pose, Step, brief
+from scanchain.data import AnyPoints, Points, Pose, Scan, Step, brief
 from scanchain.errors import ScanchainError
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from scanchain.comparison.compare import Compared
     from scanchain.graph.optimization import Optimization
-    from scanchain.odometry import Located
+    from scanchain.preprocess import Prepared
     from scanchain.sessions.changes import Changes
     from scanchain.sessions.localize import LocalizedLog
     from scanchain.sessions.merging import Merged
@@ -87,9 +87,9 @@ class SlamResult(core.SlamResult):
 class Slam(core.Slam):
     """Odometry, loop closing and pose graph: a step for every scan, the result at the end."""
 
-    def place(self, located: Located) -> Step:
-        """Add one scan that ``front_end`` located to the graph, and close loops."""
-        step = super().place(located)
+    def process(self, scan: Scan | Prepared) -> Step:
+        """Locate one scan and close loops; raises InputError as ``Odometry.process``, and after ``finish``."""
+        step = super().process(scan)
         self.steps.append(step)
         return step
 

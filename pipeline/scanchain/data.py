@@ -32,7 +32,7 @@ LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses 
 MOST_COPIES = 5  # largest number of identical scans in a row that a driver that publishes too often produces
 
 _WHOLE = (
-    ("index", "the number of the scan, from 0", 0),
+    ("index", "the number of the scan, from 0, or -1", -1),
     ("stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)", None),
     ("log_time_ns", "nanoseconds as int; of seconds int(1e9 * time_s)", None),
     ("dropped", "a number of returns, from 0", 0),
@@ -65,7 +65,7 @@ class OtherPoints(NamedTuple):
 class Scan:
     """One scan as the log holds it, invalid returns removed.
 
-    index : position of the scan in the order of log time, from 0
+    index : position of the scan in the order of log time, from 0; −1 of ``Scan.of``: it is numbered when processed
     stamp_ns : header stamp; the instant at which the scan's pose holds
     log_time_ns : when it was recorded; scans are processed in this order
     points : (N, d) float32, meters, lidar frame
@@ -113,7 +113,7 @@ class Scan:
         stamp_s: float,
         times_s: NDArray[np.floating] | None = None,
         *,
-        index: int = 0,
+        index: int = -1,
         T_odom_base: Pose | None = None,
     ) -> Scan:
         """A scan as a driver gives it.
@@ -121,6 +121,7 @@ class Scan:
         points : (N, d) meters, lidar frame; rows that are not finite are invalid returns, counted in ``dropped``
         stamp_s : seconds since any fixed instant; the pose holds then
         times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
+        index : if it is left out, odometry numbers the scan, and checks its stamp against the last ones
         T_odom_base : pose of the robot by its wheels at ``stamp_s``
         """
         from scanchain import checks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from scanchain.back_end import BackEnd, Constraint
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import (
-    AnyPoints,
     Closure,
     GraphState,
     Keyframe,
@@ -33,7 +32,7 @@ from scanchain.graph.factors import Odometry
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops import ClosureTable, refined, spread
 from scanchain.maps import SavedMap
-from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start, owned
+from scanchain.odometry import FrontEnd, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
 from scanchain.range_noise import RangeNoise
@@ -122,7 +121,6 @@ class Slam:
             config, self.dimension, prior=prior, prior_is_final=prior_is_final, is_live=is_live
         )
         self.trail = Trail(self.dimension, points_file, self.back_end.start_m, keeps_scans=self._refines)
-        self.live_stamps = LiveStamps()
 
     def __repr__(self) -> str:
         scans = counted(len(self.trail), f"{self.dimension}D scan")
@@ -154,42 +152,19 @@ class Slam:
         """Whether all scans are aligned once more at the end."""
         return self.dimension == 2 and self.config.loops.enabled and self.config.loops.refine
 
-    def track(
-        self,
-        points: AnyPoints,
-        stamp_s: float,
-        times_s: NDArray[np.floating] | None = None,
-        *,
-        T_odom_base: Pose | None = None,
-    ) -> Step:
-        """Process a scan as a driver gives it, arguments as in ``Odometry.track``: locate it and close loops.
-
-        From the first call on, a large graph is optimized in parallel: no scan waits for it.
-        """
-        self.back_end.is_live = True
-        scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
-        return self.live_stamps.passed(scan, self.process)
-
     def process(self, scan: Scan | Prepared) -> Step:
-        """Locate one scan and close loops. Raises InputError after ``finish``."""
+        """Locate one scan and close loops; raises InputError as ``Odometry.process``, and after ``finish``."""
         self._check_unfinished()
         located = self.front_end.locate(scan)
-        mine = owned(located.tracked)
-        step = self.place(located)
-        return replace(step, points=mine.matched, T_odom_lidar=mine.T_odom_lidar, match=mine.match)
-
-    def place(self, located: Located) -> Step:
-        """Add one scan that ``front_end`` located, and close loops; the arrays of the step are read-only."""
-        self._check_unfinished()
         tracked = located.tracked
         started = working_s()
         is_keyframe = self._add(located)
         closures, state = self.back_end.advance(is_keyframe=is_keyframe)
-        scan, seconds = tracked.scan, (tracked.preprocess_s, tracked.match_s, tracked.map_s)
+        seconds = (tracked.preprocess_s, tracked.match_s, tracked.map_s)
         return Step(
-            scan=scan,
+            scan=tracked.scan,
             points=tracked.matched,
-            T_odom_lidar=tracked.T_odom_lidar,
+            T_odom_lidar=tracked.T_odom_lidar.copy(),  # the original is that of the keyframe
             T_world_lidar=self.back_end.placement.T_world_odom @ tracked.T_odom_lidar,
             match=tracked.match,
             state=tracked.state,
@@ -198,7 +173,7 @@ class Slam:
             local_map=located.local_map,
             closures=closures,
             graph=state,
-            timing=Timing(scan.waited_s, *seconds, working_s() - started),
+            timing=Timing(tracked.scan.waited_s, *seconds, working_s() - started),
             starts_segment=tracked.elsewhere_m > 0.0,
         )
 

@@ -94,9 +94,10 @@ def _follow(slam: Slam, scans: Iterator[Scan], count: int) -> None:
 
 def _follow_live(slam: Slam, scans: Iterator[Scan]) -> None:
     longest_s, optimizations, before = 0.0, 0, len(slam.keyframes)
+    slam.back_end.is_live = True
     for scan in scans:
         started = perf_counter()
-        step = slam.track(scan.points, 1e-9 * scan.stamp_ns, scan.times_s, T_odom_base=scan.T_odom_base)
+        step = slam.process(scan)
         taken_s = perf_counter() - started
         longest_s, optimizations = max(longest_s, taken_s), optimizations + (step.graph is not None)
         sleep(max(_LIVE_S - taken_s, 0.0))

@@ -154,7 +154,7 @@ found = scanchain.evaluate("a.tum", "b.tum")
 print(found.ate.translation_m.rmse, found.rpe["1_s"].rotation_rad.mean, found.kitti.translation_share)
 print(scanchain.__version__, scanchain.lie.exp(np.zeros(6)), scanchain.evaluation.pair)
 print(sharpness([np.zeros((9, 3))]))
-scanchain.Odometry().track(np.zeros((9, 3)), 0.0, np.zeros(9))
+scanchain.Odometry().process(scanchain.Scan.of(np.zeros((9, 3)), 0.0, np.zeros(9)))
 """
 
 

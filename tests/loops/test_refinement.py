@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanchain import Slam, lie
-from scanchain.data import Keyframe
+from scanchain.data import Keyframe, Scan
 from scanchain.kernels.registration.icp import refine
 from scanchain.loops import refined
 from scanchain.point_store import PointStore
@@ -95,6 +95,6 @@ def test_the_first_scan_of_a_log_that_begins_at_speed_stays_at_the_origin():
     for k in range(12):
         T_world_beams = lie.pose_2d(-1.5, 0.2, 0.0) @ lie.exp((0.1 * k + times_s)[:, None] * velocity)
         beams = np.array([seen_in_room(T)[beam] for beam, T in enumerate(T_world_beams)], np.float32)
-        slam.track(beams, 0.1 * k, times_s.astype(np.float32))
+        slam.process(Scan.of(beams, 0.1 * k, times_s.astype(np.float32)))
     away_m, _ = lie.apart(np.eye(3), slam.finish().trajectory.poses[0])
     assert away_m < 0.01

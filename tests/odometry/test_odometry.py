@@ -220,7 +220,7 @@ def covariances(dimension, information, scans):
         match = first_match(T, np.zeros((9, dimension)), configured(dimension).matching)
         match = replace(match, information=information, fit=fit)
         tracked = Tracked(None, nothing, nothing, T, match, state, "", prior, 0.0, 0.0, 0.0)
-        front_end.odometry.place = lambda scan, tracked=tracked: tracked
+        front_end.odometry.process = lambda scan, tracked=tracked: tracked
         front_end.locate(None)
         told.append(np.linalg.inv(front_end.information + 1e-9 * np.eye(k)))
     return np.array(told)
@@ -270,7 +270,7 @@ def test_what_cannot_be_tracked_is_named(office, key, value, words):
     with pytest.raises(InputError, match=words):
         office.tracked([replace(scan, T_odom_base=None) for scan in office.scans[:3]], {key: value})
     with pytest.raises(InputError, match="the first one, has no points; begin with one that has some"):
-        Odometry(dimension=3).track(np.empty((0, 3)), 0.0)
+        Odometry(dimension=3).process(Scan.of(np.empty((0, 3)), 0.0))
 
 
 def test_without_loops_the_world_is_the_odometry_frame(office):
@@ -342,7 +342,7 @@ def test_a_driver_that_is_given_the_same_cloud_says_so(town):
     for index, scan in enumerate((first, first, second)):
         buffer = np.resize(buffer, scan.points.shape)
         buffer[:] = scan.points  # a driver may fill one buffer again and again
-        step = odometry.track(buffer, 0.1 * index)
+        step = odometry.process(Scan.of(buffer, 0.1 * index))
         assert step.is_repeated == (index == 1)
 
 

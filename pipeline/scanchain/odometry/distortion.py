@@ -226,7 +226,7 @@ def _residuals(
 ) -> tuple[NDArray[np.float64], tuple[float, str]]:
     """RMS residuals of blocks of scans, times multiplied by ``sense``; largest distortion and its cause."""
     odometry = Odometry(config, T_base_lidar, dimension=scans[0].points.shape[1])
-    tracked = [odometry.place(replace(scan, times_s=np.float32(sense) * scan.times_s)) for scan in scans]
+    tracked = [odometry.process(replace(scan, times_s=np.float32(sense) * scan.times_s)) for scan in scans]
     rms_m = np.array([each.match.residual_m for each in tracked[_BEGIN:]])
     blocks = [np.sqrt(np.mean(block**2)) for block in np.array_split(rms_m, len(rms_m) // _BLOCK)]
     seconds = max(1e-9 * (scans[-1].stamp_ns - scans[_BEGIN].stamp_ns), 1e-9)

@@ -61,7 +61,7 @@ class FrontEnd:
 
     def locate(self, scan: Scan | Prepared) -> Located:
         """Place one scan by odometry; it becomes a keyframe where it moved far enough from the last one."""
-        tracked = self.odometry.place(scan)
+        tracked = self.odometry.process(scan)
         distance_m, angle_rad = lie.apart(self.T_odom_keyframe, tracked.T_odom_lidar)
         is_far = distance_m > self.config.keyframe_distance_m or angle_rad > self.config.keyframe_angle_rad
         has_moved = is_far and tracked.state is not State.LOST

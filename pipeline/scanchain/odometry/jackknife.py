@@ -109,7 +109,7 @@ def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lid
                 sparse=_part(prepared.sparse, (of_sparse != group).all(axis=0)),
             )
             try:
-                result.append(odometry.place(chosen).T_odom_lidar)
+                result.append(odometry.process(chosen).T_odom_lidar)
             except InputError:
                 if group < 0:
                     raise

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config, MatchingConfig
-from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Prior, Scan, State, brief
+from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior, Scan, State, brief
 from scanchain.errors import InputError, counted, shown
+from scanchain.graph.factors import read_only
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
@@ -120,49 +121,31 @@ class Odometry:
         """The map that scans are aligned to, odom frame."""
         return self.map.surfaces
 
-    def track(
-        self,
-        points: AnyPoints,
-        stamp_s: float,
-        times_s: NDArray[np.floating] | None = None,
-        *,
-        T_odom_base: Pose | None = None,
-    ) -> Tracked:
-        """The pose of a scan as it comes from a driver.
-
-        points : (N, d) meters, lidar frame; rows that are not finite are counted in ``scan.dropped``
-        stamp_s : seconds since any fixed instant; the pose is that at the stamp
-        times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
-        T_odom_base : pose of the robot by wheel odometry at ``stamp_s``
-        Raises InputError, and ignores the scan, where its stamp is not after the last one, or where stamps or
-        ``times_s`` cannot be seconds.
-        """
-        scan = Scan.of(points, stamp_s, times_s, index=self.scans, T_odom_base=T_odom_base)
-        return self.live_stamps.passed(scan, self.process)
-
     def process(self, scan: Scan | Prepared) -> Tracked:
-        """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension.
+        """Predict, correct by registration, extend the map; a bitwise copy of the last scan changes nothing.
 
-        A bitwise copy of the scan before gets the same pose and changes nothing; its ``reason`` says so.
+        Raises InputError, and ignores the scan, if it has another dimension; one of ``Scan.of`` also if its stamp
+        is not after the last one, and if stamps or point times cannot be seconds.
         """
-        tracked = self.place(scan)
-        return msgspec.structs.replace(owned(tracked), points=tracked.points.copy())
+        given = scan.scan if isinstance(scan, Prepared) else scan
+        self._check_dimension(given)
+        if given.index >= 0:
+            return self._tracked(scan)
+        return self.live_stamps.passed(replace(given, index=self.scans), self._tracked)
 
-    def place(self, scan: Scan | Prepared) -> Tracked:
-        """As ``process``, but the arrays must not be written to: odometry uses them."""
-        self._check_dimension(scan.scan if isinstance(scan, Prepared) else scan)
+    def _tracked(self, scan: Scan | Prepared) -> Tracked:
         prepared = scan if isinstance(scan, Prepared) else prepare(scan, self.resolution)
         scan, self.resolution = prepared.scan, prepared.after
         self.scans += 1
         sample = scan.points[:: len(scan.points) // _SAMPLE + 1].tobytes()
         if self.last is not None and sample == self.last_sample and len(scan.points) >= _FEWEST_COPIED:
             repeated = scan if scan.is_copy else replace(scan, is_copy=True)
-            return msgspec.structs.replace(
-                self.last, scan=repeated, reason=COPY, is_repeated=True, elsewhere_m=0.0
+            return _owned(
+                msgspec.structs.replace(self.last, scan=repeated, reason=COPY, is_repeated=True, elsewhere_m=0.0)
             )
         self.last_sample = sample
         self.last = self._placed(prepared)
-        return self.last
+        return _owned(self.last)
 
     def _placed(self, prepared: Prepared) -> Tracked:
         started, scan = working_s(), prepared.scan
@@ -390,12 +373,13 @@ def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: i
     return config, T_base_lidar
 
 
-def owned(tracked: Tracked) -> Tracked:
-    """The same with copied arrays, except for ``points``: writing into them changes no later pose."""
+def _owned(tracked: Tracked) -> Tracked:
+    """The same with poses copied and points read-only: writing into them changes no later pose."""
     match, prior = tracked.match, tracked.prior
     return msgspec.structs.replace(
         tracked,
-        matched=tracked.matched.copy(),
+        points=read_only(tracked.points),
+        matched=read_only(tracked.matched),
         T_odom_lidar=tracked.T_odom_lidar.copy(),
         match=replace(match, T_target_source=match.T_target_source.copy(), information=match.information.copy()),
         prior=Prior(prior[0].copy(), prior[1].copy(), prior[2].copy(), prior.is_measured),

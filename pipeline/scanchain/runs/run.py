@@ -170,7 +170,7 @@ class _Run:
             if slam.dimension == 3 and threads() > 1:
                 tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
             for scan in tracked:
-                step = slam.place(slam.front_end.locate(scan))
+                step = slam.process(scan)
                 self.steps.append(step)
                 recording.log(step)
                 if checkpoints.are_due():

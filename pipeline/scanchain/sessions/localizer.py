@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.config import Config
-from scanchain.data import AnyPoints, Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
+from scanchain.data import Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
 from scanchain.errors import counted
 from scanchain.evaluation.consistency import edge_errors, with_map_errors
 from scanchain.loops.evidence import is_in_sight
@@ -134,18 +134,6 @@ class Localizer:
     def __repr__(self) -> str:
         state = self.states[-1] if self.states else MapState.SEARCHING
         return f"{type(self).__name__}({counted(len(self.states), 'scan')} in {self.map.name!r}: {state})"
-
-    def track(
-        self,
-        points: AnyPoints,
-        stamp_s: float,
-        times_s: NDArray[np.floating] | None = None,
-        *,
-        T_odom_base: Pose | None = None,
-    ) -> Placed:
-        """Localize a scan as a driver delivers it; arguments as in ``Odometry.track``."""
-        scan = Scan.of(points, stamp_s, times_s, index=len(self.states), T_odom_base=T_odom_base)
-        return self.slam.live_stamps.passed(scan, self.process)
 
     @property
     def warnings(self) -> tuple[str, ...]:

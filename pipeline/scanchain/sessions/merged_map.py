@@ -134,11 +134,8 @@ def _refined(joined: Joined, config: Config, held: int) -> Matrix:
     if joined.dimension == 3 or not config.loops.refine:
         return poses
     free = np.flatnonzero(joined.of_map != held)
-
-    def points_of(n):
-        return joined.keyframes[free[n]].points
-
-    poses[free] = refined(poses[free], points_of, joined.keyframes, joined.poses, config)
+    path = [joined.keyframes[k] for k in free.tolist()]
+    poses[free] = refined(poses[free], lambda n: path[n].points, joined.keyframes, joined.poses, config)
     return poses
 
 
