@@ -7,14 +7,16 @@ DEV := .venv/dev-installed
 BASELINES := .venv/baselines-installed
 DOCS := .venv/docs-installed
 unexport PYTHONDONTWRITEBYTECODE  # where it is set, each of many processes would compile all that it imports
+SCHEMA := $(BIN)/check-jsonschema --quiet --builtin-schema vendor
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 INSTALL := VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet
 
-.PHONY: help demo test slow lint count docs clean
+.PHONY: help demo test slow all-tests lint count docs clean
 
 help:
 	@echo "make demo   simulate an office and a town, run both, compare the town with KISS-ICP and Open3D (within four minutes)"
 	@echo "make test   run the tests, but for the slow ones"
-	@echo "make slow   run the slow tests"
+	@echo "make slow   run the slow tests; make all-tests runs both"
 	@echo "make lint   format, lint, type and import checks"
 	@echo "make count  print how many files and lines each part has"
 	@echo "make docs   build the documentation into build/docs; warnings are errors"
@@ -33,16 +35,22 @@ demo: $(BASELINES)
 	@echo "Look at the pictures in runs/, or open the recordings: $(BIN)/scanchain view runs/demo-town"
 
 test: $(DEV)
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "not slow"
+	$(PYTEST) -m "not slow"
 
 slow: $(DEV)
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow
+	$(PYTEST) -m slow
+
+all-tests: $(DEV)
+	$(PYTEST)
 
 lint: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/basedpyright
 	PYTHONPATH=pipeline:viz $(BIN)/lint-imports
+	$(SCHEMA).github-workflows .github/workflows/*.yml
+	$(SCHEMA).github-issue-forms $(filter-out %/config.yml,$(wildcard .github/ISSUE_TEMPLATE/*.yml))
+	$(SCHEMA).citation-file-format CITATION.cff
 
 count:
 	@git ls-files '*.py' | xargs wc -l | awk '$$2 != "total" { \
