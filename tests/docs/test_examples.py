@@ -1,16 +1,19 @@
 """Every example of README and docs runs as it stands and comes out as printed beside it.
 
-Of a page, in order and in one empty folder:
+Scripts of docs/examples run alone, each in an empty folder. Of a page, in order and in one empty folder:
 ``python`` fences run alone; after ``# -> `` stands what their statement prints,
 ``console`` fences run the ``scanchain`` commands after ``$ ``; the lines below are printed in that order,
-fences whose first line is a comment with nothing but a name, as ``# mine.toml``, are files.
+fences whose first line is a comment with nothing but a name, as ``# mine.toml``, are files, and so are those that
+include a script of docs/examples.
 Whole numbers agree exactly, others within one unit of the last digit shown.
 """
 
 import ast
 import json
+import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +21,8 @@ from pathlib import Path
 import pytest
 
 from scanchain.__main__ import main
-from tests.support.scenes import ROOT
+from scanchain.odometry import jackknife
+from tests.support.scenes import ROOT, SHORT_WINDOWS
 
 pytestmark = pytest.mark.error_bars
 
@@ -27,8 +31,11 @@ GIVEN = {  # what a page takes as done
     "results.md": ("simulate office log.mcap --duration 20", "run log.mcap --out runs/log --rerun off")
 }
 LONG = ("extending.md", "maps.md")
+WITHOUT_ERROR_BARS = ("extending.md", "index.md", "logs.md", "maps.md")  # none are quoted
+SCRIPTS = sorted((ROOT / "docs" / "examples").glob("*.py"))
 FENCE = re.compile(r"^(`{3,})(\w+)\n(.*?)^\1$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# (\w+\.\w+)\n")
+INCLUDED = re.compile(r"^```\{literalinclude\} (examples/\w+\.py)$", re.MULTILINE)
 NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d*)?(?:e[-+]?\d+)?", re.IGNORECASE)
 PRINTS = re.compile(r"# -> (.*)$")
 
@@ -105,12 +112,16 @@ def folder(tmp_path, monkeypatch):
     [pytest.param(page, marks=[pytest.mark.slow] * (page.name in LONG)) for page in PAGES],
     ids=lambda page: page.name,
 )
-def test_every_example_prints_what_the_page_says(page, folder, capsys):
+def test_every_example_prints_what_the_page_says(page, folder, capsys, monkeypatch):
+    if page.name in WITHOUT_ERROR_BARS:
+        monkeypatch.setattr(jackknife, "LONGEST", SHORT_WINDOWS)
     compared = ran = 0
     text = page.read_text(encoding="utf-8")
     for command in GIVEN.get(page.name, ()) if "```python" in text else ():
         assert main(command.split()) == 0
     capsys.readouterr()
+    for name in INCLUDED.findall(text):
+        shutil.copy(ROOT / "docs" / name, folder)
     for number, (language, contents) in enumerate(fences(text), start=1):
         name = f"{page.name}, block {number}"
         if file := FILE.match(contents):
@@ -121,6 +132,19 @@ def test_every_example_prints_what_the_page_says(page, folder, capsys):
     assert compared or not ran, f"{page.name}: no example says what it prints"
 
 
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param(script, marks=[pytest.mark.slow] * (script.stem == "ray_batch")) for script in SCRIPTS],
+    ids=lambda script: script.stem,
+)
+def test_every_script_prints_what_it_says(script, folder, capsys):
+    source = script.read_text(encoding="utf-8")
+    if "import ray" in source:
+        pytest.importorskip("ray", reason="the extra cluster is not installed")
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    assert run_python(source, script.name, capsys) or script.name.startswith("my_")
+
+
 @pytest.mark.slow
 def test_examples_and_their_results_pass_a_type_checker_where_the_package_is_installed(tmp_path):
     examples = tmp_path / "examples"
@@ -129,6 +153,8 @@ def test_examples_and_their_results_pass_a_type_checker_where_the_package_is_ins
         for number, (language, contents) in enumerate(fences(page.read_text(encoding="utf-8"))):
             if language == "python":
                 (examples / f"{page.stem}_{number}.py").write_text(contents, encoding="utf-8")
+    for script in SCRIPTS:
+        shutil.copy(script, examples)
     (examples / "further.py").write_text(FURTHER, encoding="utf-8")
     options = {
         "include": ["examples"],

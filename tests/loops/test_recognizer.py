@@ -101,7 +101,7 @@ def test_a_recognizer_of_ones_own_closes_loops_and_survives_checkpoints_bit_by_b
 def test_a_run_finds_it_in_the_working_directory_also_where_python_does_not_look_there(folder):
     command = [sys.executable, "-P", "-m", "scanchain", "run", shared_data(CSAIL), "--out", "run", "--end", "150"]
     command += [word for key, value in SMALL.items() for word in (f"--{key}", str(value))]
-    command += ["--loops.recognizer", "my_places:Ranges", "--rerun", "off"]
+    command += ["--loops.recognizer", "my_places:Ranges", "--rerun", "off", "--error-bars", "quick"]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "place" in pq.read_table("run/loops.parquet")["proposed_by"].to_pylist()

@@ -1,10 +1,8 @@
-"""The matcher of docs/extending.md, outside the package: named on the command line, compared, stopped, resumed."""
+"""The matcher of docs/examples, outside the package: named on the command line, compared, stopped, resumed."""
 
-import re
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,9 +16,9 @@ from scanchain.registration import VoxelMap, create_matcher
 from scanchain.runs.directory import CHECKPOINT_FILE
 from tests.support import made
 from tests.support.killing import same_result
+from tests.support.scenes import ROOT
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
-(MATCHER,) = re.findall(r"```python\n(# my_matcher\.py\n.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+MATCHER = (ROOT / "docs" / "examples" / "my_matcher.py").read_text(encoding="utf-8")
 NAME = "my_matcher:PointToPoint"
 
 
@@ -47,7 +45,7 @@ def started(folder, *words):
 
 @pytest.mark.slow
 def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
-    words = ("run", office, "--matcher", NAME, "--end", "10", "--error-bars", "quick", "--rerun", "off")
+    words = ("run", office, "--matcher", NAME, "--end", "3", "--error-bars", "quick", "--rerun", "off")
     words = (*words, "--checkpoint", "0.1")
     whole = started(folder, *words, "--out", "whole")
     assert whole.wait() == 0, whole.stderr.read()
@@ -66,7 +64,7 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
 
 @pytest.mark.slow
 def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, folder):
-    names, short = ("svd", "PointToPoint"), ("--log.end_s", "3")
+    names, short = ("svd", "PointToPoint"), ("--log.end_s", "2")
     words = ("compare", office, *short, "--methods", ",".join(names), "--matcher", NAME, "--out", "a")
     child = started(folder, *words)
     _, errors = child.communicate()

@@ -12,6 +12,7 @@ from scanchain.config import Config
 from scanchain.logs import open_log
 from scanchain.point_store import PointStore, StoredPoints
 
+SHORT_WINDOWS = {2: 12, 3: 4}  # scans that error bars are measured on, where nothing is tested of them
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data"))
 

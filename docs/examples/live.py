@@ -1,0 +1,24 @@
+"""Live SLAM: a pose after every scan, of arrays as any driver delivers them."""
+
+import scanchain
+
+
+def driver():
+    """Points (N, 2) in meters and stamp in seconds; here from a simulated log, elsewhere from your sensor."""
+    scanchain.simulate("office", "office.mcap", duration_s=10.0)
+    for scan in scanchain.open_log("office.mcap"):
+        yield scan.points, scan.stamp_ns * 1e-9
+
+
+slam = scanchain.Slam(dimension=2)
+for points, stamp_s in driver():
+    step = slam.track(points, stamp_s)  # add T_odom_base=… for wheels, times_s=… for the time of each point
+    if step.state != "ok":
+        print(step.state, step.match.reason)
+    T_world_lidar = step.T_world_lidar  # (3, 3); after a loop closure it jumps, T_odom_lidar never does
+print(T_world_lidar[:2, 2].round(2))  # -> [ 4.36 -3.09]
+
+result = slam.finish()  # closes the last loops and corrects every scan
+scanchain.write_tum("trajectory.tum", result.trajectory)
+print(result.trajectory)  # -> Trajectory(100 poses of SE(2) over 9.9 s)
+print(result.verdict().verdict, result.cloud().shape[1])  # -> trustworthy 2
