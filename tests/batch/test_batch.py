@@ -147,6 +147,7 @@ def test_a_process_that_ends_without_a_result_is_a_row_that_says_so_and_the_batc
     assert [(row["state"], row["reason"], row["tries"]) for row in rows.values()] == [("crashed", reason, 2)] * 2
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_what_is_done_is_done_until_the_file_or_the_configuration_changes(drawers, tmp_path, capfd):
     log, out = tmp_path / "log.mcap", tmp_path / "out"
     log.write_bytes((drawers / "log_00.mcap").read_bytes())

@@ -31,7 +31,7 @@ from tests.support.scenes import ROOT, configured, shared_data
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else half a minute has no closures
-RECORDED = (*LOOPING, "--checkpoint", "0.2")
+RECORDED = (*LOOPING, "--checkpoint", "0.2", "--error-bars", "quick")
 LIVELY = (*RECORDED, "--rerun", "off")
 
 
@@ -79,13 +79,12 @@ def left_after(steps, log, out, *words):
 
 
 @pytest.mark.slow
-def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_recording(undisturbed, tmp_path):
-    log, whole = undisturbed
+def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_recording(office, whole, tmp_path):
     out, stamps_ns = tmp_path / "run", read_tum(whole / "odometry.tum").stamps_ns
     assert pq.read_table(whole / "loops.parquet").num_rows > 0
     reached = []
     for interruption, share in ((signal.SIGKILL, 0.1), (signal.SIGINT, 0.25), (signal.SIGKILL, 0.4)):
-        child = killing.start(log, out, *RECORDED, "--resume")
+        child = killing.start(office, out, *RECORDED, "--resume")
         killing.wait_for_steps(child, out, share * len(stamps_ns))
         child.send_signal(interruption)
         child.wait()
@@ -94,7 +93,7 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
         assert (killing.partial(out) / RECORDING_FILE).exists()
         np.testing.assert_array_equal(table.trajectory("T_odom_lidar").stamps_ns, stamps_ns[: len(table)])
     assert 0 < reached[0] <= reached[1] <= reached[2] and reached[0] < len(stamps_ns)
-    assert killing.start(log, out, *RECORDED, "--resume").wait() == 0
+    assert killing.start(office, out, *RECORDED, "--resume").wait() == 0
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
     killing.same_result(out, whole)
     assert "note           resumed after" in (out / "summary.txt").read_text()
@@ -222,7 +221,7 @@ def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(office, tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
     out = tmp_path / "run"
-    words = ["run", str(office), "--out", str(out), *LOOPING, "--checkpoint", "0", "--rerun", "off"]
+    words = ["run", str(office), "--out", str(out), *LIVELY, "--checkpoint", "0"]
     child = after(WAITING, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout.readline() == "there\n"
     child.send_signal(signal.SIGINT)
