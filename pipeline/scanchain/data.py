@@ -374,7 +374,7 @@ class GraphState:
     stamps_ns : (K,) int64
     edges : (E, 2) int64 keyframe pairs (i, j), loops last; i is −1 for a prior on a single keyframe
     is_loop : (E,) bool
-    weight : (E,) robust weight in [0, 1] that the optimizer left to each edge; 1 for odometry
+    weight : (E,) robust weight in [0, 1] after the optimization; 1 for edges without a robust loss
     chi2 : Σ w eᵀΩe of the edges in force: all but the rejected ones
     edge_chi2 : (E,) eᵀΩe of each edge, without its robust weight
     degrees_of_freedom : number of measured values of the edges in force, minus that of the unknowns
@@ -392,8 +392,17 @@ class GraphState:
 
     @property
     def is_rejected(self) -> NDArray[np.bool_]:
-        """Loop edges that contradict the rest and are not in force, (E,)."""
+        """Edges with a robust loss that contradict the rest and are not in force, (E,)."""
         return self.weight < REJECTED_WEIGHT
+
+    @property
+    def drawn_edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Edges (n, 2) between poses: those in force of successive ones, those of others, and rejected ones."""
+        is_relative, is_rejected = self.edges[:, 0] >= 0, self.is_rejected
+        skips = np.abs(self.edges[:, 0] - self.edges[:, 1]) != 1
+        groups = (~skips & ~is_rejected, skips & ~is_rejected, is_rejected)
+        chain, loops, rejected = (self.edges[group & is_relative] for group in groups)
+        return chain, loops, rejected
 
 
 def fit_text(chi2: float, degrees_of_freedom: int, rejected: str, *, has_loops: bool) -> str:

@@ -10,7 +10,7 @@ from scanchain.config import GraphConfig
 from scanchain.data import KeyframeErrors
 from scanchain.errors import InputError
 from scanchain.evaluation.consistency import with_map_errors
-from scanchain.graph.factors import FACTORS, ORIGIN, Factor, Odometry, Position, Prior
+from scanchain.graph.factors import FACTORS, ORIGIN, Factor, Odometry, Position, Prior, RobustPosition, RobustPrior
 from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.graph.optimization import GraphChange
 from scanchain.graph.pose_graph import PoseGraph
@@ -227,7 +227,7 @@ class Flat(Factor):
     ("factor", "words", "text"),
     [
         (Heading, {}, "factor is .*; wanted a Factor"),
-        (Heading(), {"j": 9}, "edge -1-9 joins a pose that is not there"),
+        (Heading(), {"j": 9}, "factor of pose 9 joins a pose that is not there"),
         (Heading(), {"information": np.eye(2)}, r"Heading.error returned .*; wanted .* of the shape \(2, 2\)"),
         (Heading(), {"information": np.eye(4)}, r"information has the shape \(4, 4\); wanted \(m, m\)"),
         (Flat(), {}, r"Flat.error returned \[0.0, 0.0\]; wanted finite numbers of the shape \(2, 1\)"),
@@ -289,3 +289,97 @@ def test_a_prior_is_measured_anew_from_the_origin_and_no_custom_factor_places_a_
     graph.add_factor(Range((0.0, 0.0), float(np.linalg.norm((true[3] @ [2.0, 0.0, 1.0])[:2]))), point, [[1.0]])
     assert graph.optimize(GraphConfig(), initialize="odometry").iterations <= 2
     assert np.allclose(graph.poses[point, :2, 2], (true[3] @ [2.0, 0.0, 1.0])[:2])
+
+
+def test_a_prior_without_information_constrains_nothing():
+    graph, true = drive(off=0.02)
+    plain, _ = drive(off=0.02)
+    graph.add_factor(Prior(), 4, np.zeros((3, 3)), true[4] @ lie.pose_2d(5.0, 0.0, 1.0))
+    for initialize in ("auto", "odometry", "chordal"):
+        graph.optimize(GraphConfig(), initialize=initialize)
+        plain.optimize(GraphConfig(), initialize=initialize)
+        assert np.allclose(graph.poses, plain.poses, atol=1e-9)
+    assert graph.fixed.tolist() == [True] + [False] * 7 and graph.certify().certified
+    assert np.isfinite(graph.covariances()).all()
+
+
+@pytest.mark.parametrize("initialize", ["odometry", "spanning-tree", "chordal"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_initial_poses_come_from_positions_in_the_world_alone(dimension, initialize):
+    rng, k = np.random.default_rng(5), lie.twist_size(lie.identity(dimension))
+    true = lie.exp(rng.normal(size=(6, k)))
+    edges = np.array([(i, i + 1) for i in range(5)])
+    graph = graph_of(lie.exp(rng.normal(size=(6, k))), edges, lie.between(*true[edges.T]), np.eye(k))
+    for j in (0, 2, 3, 5):
+        graph.add_factor(Position(), j, np.eye(dimension), true[j])
+    done = graph.optimize(GraphConfig(robust="none"), initialize=initialize)
+    assert done.chi2_before > 1.0 and done.iterations <= 1
+    assert np.allclose(graph.poses, true, atol=1e-6)
+
+
+def test_the_origin_is_no_pose_in_messages():
+    graph, true = drive(3)
+    graph.add_factor(Prior(), 0, np.eye(3), true[0])
+    lone = graph.add_pose(lie.identity(2), 9)
+    with pytest.raises(InputError, match=f"1 of 4 poses are not joined to a fixed one: {lone};"):
+        graph.optimize(GraphConfig())
+    graph, true = drive(4)
+    graph.add_factor(Prior(), 2, np.eye(3), true[2] @ lie.pose_2d(0.0, 0.0, 2.5))
+    graph.add_factor(Prior(), 0, np.eye(3), true[0])
+    graph.optimize(GraphConfig())
+    assert graph.certify().reason.endswith("first the prior of 2")
+    graph.fix(0)
+    graph.optimize(GraphConfig())
+    assert graph.certify().reason == "the origin and 1 pose are fixed; the bound is for one"
+
+
+@pytest.mark.parametrize("robust", ["truncated", "huber", "geman-mcclure"])
+@pytest.mark.parametrize(("off_rad", "is_rejected"), [(3.2, False), (3.4, True)])
+def test_a_factor_is_rejected_above_the_limit_for_its_own_number_of_residuals(robust, off_rad, is_rejected):
+    """The 99.9 % quantile of χ² is 3.29² for one residual, and 4.03² for three."""
+    graph, true = drive()
+    graph.fix(0)
+    for k in range(7):
+        graph.add_edge(k, k + 1, lie.between(true[k], true[k + 1]), 1e8 * np.eye(3))
+    graph.add_factor(Heading(), 5, [[1e4]], true[5] @ lie.pose_2d(0.0, 0.0, 1e-2 * off_rad))
+    graph.optimize(GraphConfig(robust=robust))
+    assert graph.is_rejected.tolist() == [False] * 14 + [is_rejected]
+
+
+@pytest.mark.parametrize("robust", ["truncated", "huber", "cauchy"])
+@pytest.mark.parametrize("factor", [RobustPosition(), RobustPrior()], ids=lambda factor: type(factor).__name__)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_outliers_among_robust_priors_are_rejected_and_are_seen_in_the_result(dimension, factor, robust, tmp_path):
+    rng, k, count = np.random.default_rng(2), lie.twist_size(lie.identity(dimension)), 40
+    step = lie.exp(np.eye(k)[0] + 0.15 * np.eye(k)[-1])
+    true = [lie.exp(rng.normal(size=k))]
+    for _ in range(count - 1):
+        true.append(true[-1] @ step)
+    true, sigma = np.array(true), np.full(k, 0.01)
+    edges = np.array([(i, i + 1) for i in range(count - 1)])
+    measured = lie.between(*true[edges.T]) @ lie.exp(sigma * rng.normal(size=(count - 1, k)))
+    graph = graph_of(lie.inverse(true[0]) @ true, edges, measured, np.diag(sigma**-2.0))
+    m = dimension if isinstance(factor, Position) else k
+    for j in range(0, count, 2):
+        graph.add_factor(factor, j, 100.0 * np.eye(m), true[j] @ lie.exp(0.1 * rng.normal(size=k)))
+    for j in (6, 13, 20, 27):
+        off = lie.exp(rng.choice([-3.0, 3.0], size=k) * (np.arange(k) < dimension))
+        graph.add_factor(factor, j, 100.0 * np.eye(m), true[j] @ off)
+    done = graph.optimize(GraphConfig(robust=robust))
+    assert not graph.is_loop.any() and not graph.fixed.any()
+    assert np.array_equal(done.rejected, np.arange(len(graph.edges)) >= len(graph.edges) - 4)
+    assert np.array_equal(done.rejected, graph.is_rejected)
+    assert np.linalg.norm((graph.poses - true)[:, :dimension, dimension], axis=1).max() < 0.3
+    assert np.isfinite(graph.covariances()).all()
+    write_g2o(tmp_path / "x.g2o", graph)
+    assert len(read_g2o(tmp_path / "x.g2o").graph.edges) == len(graph.edges) - 4
+
+
+def test_the_relative_covariance_is_of_two_poses_of_the_graph():
+    graph, true = drive(3)
+    graph.add_factor(Prior(), 0, np.eye(3), true[0])
+    graph.optimize(GraphConfig())
+    assert np.isfinite(graph.relative_covariance(0, 2)).all()
+    for i, j in ((ORIGIN, 2), (0, ORIGIN), (0, 3)):
+        with pytest.raises(InputError, match=r"is (-1|3), and the graph has 3 poses"):
+            graph.relative_covariance(i, j)

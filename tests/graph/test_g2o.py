@@ -6,6 +6,7 @@ from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, ranks
+from scanchain.graph.factors import Prior
 from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.settings import load_settings
 from tests.support.graphs import graph_of
@@ -206,7 +207,7 @@ def test_a_poor_fit_points_to_the_robust_losses_which_leave_the_chain_alone(call
         out = tmp_path / f"{loss}.g2o"
         _, output, _ = call("optimize", tmp_path / "false.g2o", "--robust", loss, "--out", out)
         assert "where 1 is expected" not in output
-        assert "on 7 loop edges; the other 7 edges (odometry, points) in full weight" in output
+        assert "on 7 loop edges; the other 7 edges (odometry, points, priors) in full weight" in output
         assert read_g2o(out).graph.poses[-1][0, 2] == pytest.approx(7.0, abs=0.01)
 
 
@@ -326,3 +327,70 @@ def test_optimize_says_that_lines_it_does_not_know_do_not_count_and_keeps_them(t
     assert "1 line EDGE_SE3_XYZPRIOR not understood: in neither chi2 nor certificate" in text
     assert "globally optimal of the problem without 1 line EDGE_SE3_XYZPRIOR" in text
     assert PRIORS[0] in (tmp_path / "b.g2o").read_text().splitlines()
+
+
+PLANE = "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in (0, 1)) + "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
+SPACE = "".join(f"VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1\n" for k in (0, 1))
+UNIT = " ".join("1" if a == b else "0" for a in range(6) for b in range(a, 6))
+SPACE += f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {UNIT}\n"
+PRIOR = f"EDGE_SE3_PRIOR 1 0 1 0 0 0 0 0 1 {UNIT}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (f"{PLANE}EDGE_PRIOR_SE2 1 1 0 0 1 0 0 -1 0 1\n", 4),
+        (f"{PLANE}EDGE_PRIOR_SE2_XY 1 1 0 1 5 1\n", 4),
+        (f"{SPACE}{PRIOR.replace(UNIT, UNIT[:-1] + '-1')}", 4),
+    ],
+)
+def test_indefinite_information_of_a_prior_is_projected_as_that_of_edges(text, line, read):
+    with pytest.warns(UserWarning, match=f"1 of 2 edges have an indefinite .* first 1 in line {line}"):
+        file = read(text)
+    assert positive_semidefinite(file.graph.information).all() and file.graph.edges[1, 1] == 1
+    with pytest.raises(InputError, match=rf"x\.g2o:{line}: information matrix of prior 1 is not positive"):
+        read(text, indefinite="refuse")
+
+
+def test_a_prior_is_of_a_pose_or_of_a_point_as_its_tag_says(read, tmp_path):
+    text = f"{PLANE}VERTEX_XY 7 2 3\nEDGE_SE2_XY 0 7 2 3 1 0 1\n"
+    for tag, vertex, numbers in (
+        ("EDGE_PRIOR_SE2", 7, "2 3 0 1 0 0 1 0 1"),
+        ("EDGE_PRIOR_SE2_XY", 7, "2 3 1 0 1"),
+        ("EDGE_PRIOR_XY", 1, "2 3 1 0 1"),
+    ):
+        with pytest.raises(InputError, match=rf"x\.g2o:6: the prior is of a .*, and vertex {vertex} is a "):
+            read(f"{text}{tag} {vertex} {numbers}\n")
+    file = read(f"{text}EDGE_PRIOR_XY 7 2 3 4 1 4\n")
+    write_g2o(tmp_path / "y.g2o", file.graph, ids=file.ids)
+    again = read_g2o(tmp_path / "y.g2o").graph
+    assert_same(file.graph, again)
+    assert again.edges[-1].tolist() == [-1, 2] and again.is_point[2]
+    with pytest.raises(InputError, match="Prior measures a rotation, which points have not"):
+        again.add_factor(Prior(), 2, np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("offset", "line", "words"),
+    [
+        ("PARAMS_SE3OFFSET 0 0.1 0 0 0 0 0 1", 4, "EDGE_SE3_PRIOR with an offset of the sensor"),
+        ("PARAMS_SE3OFFSET 0 zero 0 0 0 0 0 1", 5, "PARAMS_SE3OFFSET: could not convert"),
+        ("PARAMS_SE3OFFSET 0 0 0 0", 5, "PARAMS_SE3OFFSET has 4 values, needs 8"),
+        ("PARAMS_SE3OFFSET x 0 0 0 0 0 0 1", 5, "PARAMS_SE3OFFSET: vertex id 'x' is not"),
+    ],
+)
+def test_the_offset_of_a_sensor_counts_wherever_it_stands(offset, line, words, read):
+    with pytest.raises(InputError, match=rf"x\.g2o:{line}: {words}"):
+        read(f"{SPACE}{PRIOR}{offset}\n")
+    assert read(f"{SPACE}{offset}\n").other_lines == (offset,)  # no prior needs it
+
+
+def test_a_sensor_offset_of_other_lines_keeps_its_id(read, tmp_path):
+    graph = read(SPACE + PRIOR).graph
+    others = ["PARAMS_SE3OFFSET 0 0.1 0 0 0 0 0 1", "PARAMS_CAMERACALIB 1 0 0 0 0 0 0 1 1 1 1 1"]
+    for _ in range(2):
+        write_g2o(tmp_path / "y.g2o", graph, other_lines=others, force=True)
+        again = read_g2o(tmp_path / "y.g2o")
+        assert set(again.other_lines) == {*others, "PARAMS_SE3OFFSET 2 0 0 0 0 0 0 1"}
+        assert_same(graph, again.graph)
+        others = again.other_lines

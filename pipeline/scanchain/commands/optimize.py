@@ -212,8 +212,8 @@ class _Report:
         loops, certified = int(graph.is_loop.sum()), self.certificate.verdict
         if loops:
             certified += ", with fixed robust weights"
-            others = f"the other {counted(len(graph.edges) - loops, 'edge')} (odometry, points) in full weight"
-            lines.append(("robust", f"on {counted(loops, 'loop edge')}; {others}"))
+            others = f"{counted(len(graph.edges) - loops, 'edge')} (odometry, points, priors)"
+            lines.append(("robust", f"on {counted(loops, 'loop edge')}; the other {others} in full weight"))
             rest = "; they do not count" if done.rejected.any() else ""
             lines.append(("rejected", f"{done.rejected.sum():,} of {loops:,} loop edges{rest}"))
         if len(self.free):

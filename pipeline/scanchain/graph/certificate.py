@@ -85,7 +85,7 @@ def certify(
     Cholesky factorization succeeds, so the claim holds up to its rounding. Edges too far from their measurements
     for such a function, or without information in some direction, are bounded by zero if their χ² is a small
     share: it is then part of the gap. Poses that are ``undetermined``, as text, preclude a certificate.
-    ``names`` (K,) are the names of the poses in messages.
+    ``names`` (K,) are the names of the poses in messages, without the origin, the last vertex of some problems.
     """
     begin = working_s()
     kept = weights > 0.0
@@ -113,8 +113,11 @@ def _gap(
     if unknown.any():
         what = sorted({problem.factors[kind].name for kind in problem.kind[unknown].tolist()})
         return chi2, f"there is no bound for {counted(int(unknown.sum()), 'edge')} of {' and '.join(what)}"
-    if len(poses) - n > 1:
-        return chi2, f"{len(poses) - n} poses are fixed; the bound is for one"
+    fixed = np.unique(problem.edges[problem.variable[problem.edges] < 0])
+    if len(fixed) > 1:
+        held = counted(int((fixed < len(names)).sum()), "pose")
+        what = f"the origin and {held}" if fixed[-1] == len(names) else held
+        return chi2, f"{what} are fixed; the bound is for one"
     centered = poses.copy()
     centered[:, :-1, -1] -= centered[:, :-1, -1].mean(axis=0)
     minorants = minorize(problem, centered, weights)
@@ -122,9 +125,10 @@ def _gap(
     given_up = float(of_edges[loose].sum())
     is_apart = not is_connected(problem.edges[~loose], problem.variable < 0)
     if loose.any() and (given_up > _GIVEN_UP[-1] * chi2 or is_apart):
-        i, j = names[problem.edges[loose][0]]
+        i, j = problem.edges[loose][0]
+        first = f"{names[i]}-{names[j]}" if i < len(names) else f"the prior of {names[j]}"
         far = f"{counted(int(loose.sum()), 'edge')} too far from what was measured, or too little informative"
-        return chi2, f"{far}, to be bounded, first {i}-{j}"
+        return chi2, f"{far}, to be bounded, first {first}"
     blocks, residual = dual_matrix(problem, minorants, ~loose)
     pattern = BlockPattern(np.where(problem.is_point[problem.free], 1, d + 1), problem.pattern.pairs)
     packing = Packing(pattern, d + 1, at_end=True)

@@ -135,7 +135,7 @@ def check_edges(
     text = ": information matrix is not symmetric positive semidefinite; give an inverse covariance"
     for is_bad, words in [*faults, (~is_sound, text)]:
         for i, j in edges[is_bad][:1].tolist():
-            raise InputError(f"edge {i}-{j}{words}")
+            raise InputError(f"{f'factor of pose {j}' if with_origin and i == ORIGIN else f'edge {i}-{j}'}{words}")
 
 
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
@@ -161,13 +161,16 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
 
 
 def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64]) -> None:
-    """Raise InputError if no chain of edges joins some pose to a fixed one; ``names`` (K,) are the poses'."""
-    if not len(fixed):
+    """Raise InputError if no chain of edges joins some pose to a fixed one.
+
+    fixed : of the poses, and perhaps the origin after them; names : (K,) of the poses
+    """
+    if not len(names):
         raise InputError("the pose graph has no poses; add some before optimizing")
     apart = loose(edges, fixed)
     if len(apart):
         raise InputError(
-            f"pose graph: {len(apart)} of {len(fixed)} poses are not joined to a fixed one:"
+            f"pose graph: {len(apart)} of {len(names)} poses are not joined to a fixed one:"
             f" {listed(names[apart])}; add edges to them whose information is not zero, or fix one of them"
         )
 

@@ -14,7 +14,7 @@ from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.consistency import apart
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks, responses
 from scanchain.graph.initialize import Initialization
-from scanchain.graph.losses import rejection_limit
+from scanchain.graph.losses import limit_shares, rejection_limit
 from scanchain.graph.minimizer import Minimum
 from scanchain.graph.odometry_errors import (
     FEWEST,
@@ -137,8 +137,9 @@ class Explainer:
         minimum, problem = explained.minimum, explained.problem
         odometry = odometry_of(problem.edges, problem.is_odometry)
         kept = minimum.weights > REJECTED_WEIGHT
+        rejected = limit_shares(self.config.robust_scale, problem.residuals[~kept], problem.freedom).sum()
         own = explained.explanation.cost(self.measured[odometry], self.information[odometry], price, self._nominal)
-        return float(minimum.estimate.chi2[kept].sum()) + price * int((~kept).sum()) + own
+        return float(minimum.estimate.chi2[kept].sum() + price * rejected) + own
 
     @staticmethod
     def _is_large(explained: Explained) -> bool:

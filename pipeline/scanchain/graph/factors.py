@@ -140,6 +140,18 @@ class Prior(Between):
     name = "prior"
 
 
+class RobustPrior(Prior):
+    """The whole pose in the world, which may be an outlier."""
+
+    is_robust = True
+
+
+class RobustPosition(Position):
+    """The position in the world, which may be an outlier, as of GNSS."""
+
+    is_robust = True
+
+
 class Sighting(Position):
     """The position of a point, or of a pose, seen from another pose."""
 
@@ -153,17 +165,26 @@ class LoopSighting(Sighting):
     is_robust = True
 
 
-FACTORS: tuple[Factor, ...] = (Odometry(), Loop(), Sighting(), LoopSighting(), Prior(), Position())
-ODOMETRY, LOOP, SIGHTING, LOOP_SIGHTING, PRIOR, _ = range(len(FACTORS))  # kind of an edge: index in the table
-LOOPS, SIGHTINGS = (LOOP, LOOP_SIGHTING), (SIGHTING, LOOP_SIGHTING)
-WHOLE = (ODOMETRY, LOOP, PRIOR)  # kinds that measure position and rotation
+FACTORS: tuple[Factor, ...] = (
+    Odometry(), Loop(), Sighting(), LoopSighting(), Prior(), Position(), RobustPrior(), RobustPosition(),
+)  # fmt: skip
+
+
+def _kinds(*classes: type[Factor]) -> tuple[int, ...]:
+    """Kinds of edges, indices in the table, whose factors are of these classes."""
+    return tuple(kind for kind, factor in enumerate(FACTORS) if isinstance(factor, classes))
+
+
+ODOMETRY, LOOP, SIGHTING, LOOP_SIGHTING = RELATIVE = range(4)  # kinds of edges between poses
+LOOPS, SIGHTINGS = _kinds(Loop, LoopSighting), _kinds(Sighting)
+WHOLE = _kinds(Between)  # those that measure position and rotation
 
 
 def kinds_of(
     edges: NDArray[np.int64],
     information: Matrix,
     is_point: NDArray[np.bool_],
-    is_loop: NDArray[np.bool_] | None = None,
+    is_loop: NDArray[np.bool_] | bool = False,
 ) -> NDArray[np.int64]:
     """Kind (E,) of edges between poses: those to points, or whose Ω (E, k, k) has no rotation, are sightings.
 
@@ -171,8 +192,7 @@ def kinds_of(
     """
     d = 2 if information.shape[-1] == 3 else 3
     is_sighting = is_point[edges].any(axis=1) | ~information[:, d:].any(axis=(1, 2))
-    kind = np.where(is_sighting, SIGHTING, ODOMETRY)
-    return kind if is_loop is None else kind + is_loop
+    return np.where(is_sighting, np.where(is_loop, LOOP_SIGHTING, SIGHTING), np.where(is_loop, LOOP, ODOMETRY))
 
 
 def of_residuals(information: ArrayLike, freedom: int, factor: Factor) -> Matrix:

@@ -6,6 +6,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import count as numbers_from
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -64,9 +65,11 @@ TAGS = {
 PRIOR_TAGS = {  # of unary edges; in 3D the vertex id is followed by the id of a sensor offset
     "EDGE_PRIOR_SE2": Tag(2, 1, tuple(range(9))),
     "EDGE_PRIOR_SE2_XY": Tag(2, 1, (0, 1, 3, 4, 6)),
+    "EDGE_PRIOR_XY": Tag(2, 1, (0, 1, 3, 4, 6), is_point=True),
     "EDGE_SE3_PRIOR": Tag(3, 2, tuple(range(28))),
 }
-_NO_OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"
+_OFFSET = "PARAMS_SE3OFFSET"
+_TAGS = TAGS | PRIOR_TAGS | {_OFFSET: Tag(3, 1, tuple(range(7)))}
 _WIDTHS = {(2, 1): 3, (2, 2): 9, (3, 1): 7, (3, 2): 28}  # numbers of a complete line, by dimension and ids
 
 
@@ -120,7 +123,8 @@ class Lines:
     """Content of a file; an invalid line raises an error with its line number.
 
     dimension : 2 or 3
-    vertices, edges, priors : their lines, those of priors with the vertex twice
+    vertices, edges : their lines, the edges followed by priors, which have their vertex twice
+    between : number of edges without the priors
     fixed : line and vertex id (n, 2) of every fixed pose
     others : lines of other tags
     note : as in ``G2oFile``
@@ -133,6 +137,7 @@ class Lines:
         self.others, self.note = list[str](), ""
         comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
         fixed, rows, priors = list[tuple[int, int]](), list[_Row](), list[_Row]()
+        offsets, sensors = list[tuple[int, list[str]]](), list[tuple[int, int]]()
         for number, line in enumerate(self._text().splitlines(), start=1):
             words = line.split()
             if words[:1] == ["FIX"]:
@@ -142,16 +147,19 @@ class Lines:
             elif words and words[0] in TAGS:
                 rows.append((number, TAGS[words[0]], *self._parsed(number, words)))
             elif words and words[0] in PRIOR_TAGS:
-                (vertex, *offset), numbers = self._parsed(number, words)
-                self._check_offset(number, offset)
+                (vertex, *sensor), numbers = self._parsed(number, words)
+                sensors += [(number, each) for each in sensor]
                 priors.append((number, PRIOR_TAGS[words[0]], [vertex, vertex], numbers))
             elif words:
                 self.others.append(line)
+                offsets += [(number, words)] if words[0] == _OFFSET else []
+        self._check_sensors(sensors, offsets)
         self.fixed = np.array(fixed, np.int64).reshape(-1, 2)
         rows.sort(key=lambda row: row[1].is_point)
-        self.vertices, self.edges = (self._whole([row for row in rows if row[1].ids == n], n) for n in (1, 2))
-        self.priors = self._whole(priors, 2)
-        if not len(self.edges.lines):
+        vertices, edges = ([row for row in rows if row[1].ids == n] for n in (1, 2))
+        self.vertices, self.edges = self._whole(vertices, 1), self._whole(edges + priors, 2)
+        self.between = len(edges)
+        if not edges:
             raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
 
     def error(self, line: object, text: str) -> InputError:
@@ -198,7 +206,7 @@ class Lines:
 
     def _parsed(self, line: int, words: list[str]) -> tuple[list[int], list[float]]:
         """Vertex ids and numbers of a line."""
-        name, tag = words[0], (TAGS | PRIOR_TAGS)[words[0]]
+        name, tag = words[0], _TAGS[words[0]]
         if self.dimension not in (0, tag.dimension):
             raise self.error(line, f"{name} in an SE({self.dimension}) graph; use one dimension per file")
         self.dimension = tag.dimension
@@ -216,14 +224,12 @@ class Lines:
             raise self.error(line, f"{fault}; write meters and radians, and an inverse covariance of these")
         return ids, numbers
 
-    def _check_offset(self, line: int, offset: list[int]) -> None:
-        """Raise InputError for a prior of a sensor that is offset from the vertex, by the PARAMS lines above."""
-        for words in map(str.split, self.others):
-            is_its = words[:2] == ["PARAMS_SE3OFFSET", *map(str, offset)]
-            if is_its and words[2:8] != _NO_OFFSET.split()[2:8] and list(map(float, words[2:8])) != [0.0] * 6:
-                raise self.error(
-                    line, "EDGE_SE3_PRIOR with an offset of the sensor; give it for the vertex itself"
-                )
+    def _check_sensors(self, sensors: list[tuple[int, int]], offsets: list[tuple[int, list[str]]]) -> None:
+        """Raise InputError for a prior (line, id) of a sensor with an offset from the vertex (line, words)."""
+        parsed = [self._parsed(line, words) for line, words in offsets] if sensors else []
+        moved = {sensor for (sensor,), offset in parsed if any(offset[:6])}
+        for line in [line for line, sensor in sensors if sensor in moved][:1]:
+            raise self.error(line, "EDGE_SE3_PRIOR with an offset of the sensor; give it for the vertex itself")
 
     def _vertex_id(self, line: int, tag: str, word: str) -> int:
         try:
@@ -236,7 +242,7 @@ class Lines:
         """Vertices or edges as complete g2o lines."""
         numbers = np.zeros((len(rows), _WIDTHS.get((self.dimension, ids), 0)))
         for tag in {row[1] for row in rows}:
-            of_tag = [place for place, row in enumerate(rows) if row[1] is tag]
+            of_tag = [place for place, row in enumerate(rows) if row[1] == tag]
             numbers[np.ix_(of_tag, tag.columns)] = [rows[place][3] for place in of_tag]
         lines = np.array([line for line, *_ in rows], np.int64)
         is_point = np.array([tag.is_point for _, tag, *_ in rows], np.bool_)
@@ -307,10 +313,10 @@ def write_g2o(
     lines += [f"FIX {names[index]}" for index in graph.held]
     between, of_one = pairs[~is_prior], of_edges[is_prior]
     lines += write_lines(d, names[between], of_edges[~is_prior], graph.is_point[between[:, 1]], is_toro=is_toro)
-    lines += _prior_lines(d, names[pairs[is_prior, 1]], of_one, information[is_prior])
-    other_lines = [line for line in other_lines if line not in lines]  # the offset of priors is written once
+    others, seen = list(other_lines), pairs[is_prior, 1]
+    lines += _prior_lines(d, names[seen], of_one, information[is_prior], graph.is_point[seen], others)
     with checks.writing(path, force=force):
-        write_whole(path, "\n".join([*lines, *other_lines, ""]).encode())
+        write_whole(path, "\n".join([*lines, *others, ""]).encode())
 
 
 def _written(path: Path, graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -322,12 +328,28 @@ def _written(path: Path, graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray
     return chosen & ~graph.is_custom
 
 
-def _prior_lines(d: int, names: NDArray[np.int64], numbers: Matrix, information: Matrix) -> list[str]:
-    """Lines of priors (n,) on whole poses or, where Ω has no rotation, on positions."""
-    lines = [_NO_OFFSET] if d == 3 and len(names) else []
-    for name, row, omega in zip(names.tolist(), numbers.tolist(), information, strict=True):
-        tag = "EDGE_SE3_PRIOR" if d == 3 else "EDGE_PRIOR_SE2" if omega[d:].any() else "EDGE_PRIOR_SE2_XY"
-        ids = [str(name), "0"][: PRIOR_TAGS[tag].ids]
+def _prior_lines(
+    d: int,
+    names: NDArray[np.int64],
+    numbers: Matrix,
+    information: Matrix,
+    is_point: NDArray[np.bool_],
+    others: list[str],
+) -> list[str]:
+    """Lines of priors (n,) on whole poses or, where Ω has no rotation, on positions.
+
+    In 3D a sensor without an offset is defined first, with an id that no parameter in ``others`` has, the other
+    lines of the file.
+    """
+    used = {words[1] for words in map(str.split, others) if words[0].startswith("PARAMS") and len(words) > 1}
+    sensors = ((str(number), f"{_OFFSET} {number} 0 0 0 0 0 0 1") for number in numbers_from(0))
+    sensor, line = next(each for each in sensors if each[1] in others or each[0] not in used)
+    lines = [line] if d == 3 and len(names) and line not in others else []
+    tag = "EDGE_SE3_PRIOR"
+    for name, row, omega, point in zip(names.tolist(), numbers.tolist(), information, is_point, strict=True):
+        if d == 2:
+            tag = "EDGE_PRIOR_XY" if point else "EDGE_PRIOR_SE2" if omega[d:].any() else "EDGE_PRIOR_SE2_XY"
+        ids = [str(name), sensor][: PRIOR_TAGS[tag].ids]
         lines.append(" ".join([tag, *ids, *(repr(row[column]) for column in PRIOR_TAGS[tag].columns)]))
     return lines
 
@@ -345,9 +367,9 @@ Indefinite = Literal["project", "refuse"]
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """Edges of a file with an indefinite information matrix, and the change by projecting it.
+    """Edges and priors of a file with an indefinite information matrix, and the change by projecting it.
 
-    edges, of : number of these edges, and of all edges
+    edges, of : number of these, and of all
     median, most : median and largest ‖Ω − Ω₊‖ / ‖Ω‖ of these, Frobenius norm
     first : the first of them, by its vertices and its line
     """
@@ -416,22 +438,17 @@ def read_g2o(
     """
     path = checks.path(path, "path")
     lines = Lines(path)
-    edges, dimension = lines.edges, lines.dimension
+    edges, dimension, between = lines.edges, lines.dimension, slice(lines.between)
     ids, is_point, poses = _vertices(lines)
-    pairs = lines.indices(edges.lines, edges.ids, ids)
-    lines.check_known(
-        edges.lines, edges.ids, np.stack([~is_point[pairs[:, 0]], is_point[pairs[:, 1]] == edges.is_point], axis=1)
-    )
-    for bad in np.flatnonzero(pairs[:, 0] == pairs[:, 1])[:1]:
-        i, j = edges.ids[bad]
-        raise lines.error(edges.lines[bad], f"edge {i}-{j} joins a vertex to itself; remove it")
+    pairs = _pairs(lines, ids, is_point)
     fixed = lines.indices(lines.fixed[:, 0], lines.fixed[:, 1:], ids)[:, 0]
     is_quaternion = dimension == 3 and (rotation or lines.rotation) == "quaternion"
     measurements, information = lines.poses(edges), _information(edges, dimension, is_quaternion=is_quaternion)
+    is_whole = np.asarray(information[:, dimension:].any(axis=(1, 2)))
     projection = _project(lines, information, indefinite)
     has_guess = bool(len(lines.vertices.lines))
     if not has_guess:
-        chain, to_points = ~edges.is_point, edges.is_point
+        chain, to_points = (np.flatnonzero(edges.is_point[between] == point) for point in (False, True))
         is_held = np.isin(np.arange(len(ids)), fixed if len(fixed) else 0)
         poses = follow_odometry(poses, is_held, pairs[chain], measurements[chain])
         i, j = pairs[to_points].T
@@ -441,21 +458,34 @@ def read_g2o(
     graph = PoseGraph(dimension, ids, left_out)
     for pose, point, stamp in zip(poses, is_point.tolist(), ids.tolist(), strict=True):
         graph.add_point(pose[:-1, -1], stamp) if point else graph.add_pose(pose, stamp)
-    is_robust = (loops == "robust") & skip_poses(pairs, is_point)
-    graph.add_edges(pairs, measurements, information, is_robust)
-    priors, of_priors = lines.priors, _information(lines.priors, dimension, is_quaternion=is_quaternion)
-    seen = lines.indices(priors.lines, priors.ids, ids)[:, 1].tolist()
-    for index, Z, omega in zip(seen, lines.poses(priors), of_priors, strict=True):
-        if omega[dimension:].any():
-            graph.add_factor(Prior(), index, omega, Z)
-        else:
-            graph.add_factor(Position(), index, omega[:dimension, :dimension], Z)
+    is_robust = (loops == "robust") & skip_poses(pairs[between], is_point)
+    graph.add_edges(pairs[between], measurements[between], information[between], is_robust)
+    for prior in range(lines.between, len(pairs)):
+        factor, m = (Prior(), graph.freedom) if is_whole[prior] else (Position(), dimension)
+        graph.add_factor(factor, int(pairs[prior, 1]), information[prior, :m, :m], measurements[prior])
     for index in fixed.tolist():
         graph.fix(index)
     note = f"{path}: {left_out} not understood: in neither χ² nor certificate nor covariances" if left_out else ""
     for text in filter(None, (lines.note, note)):
         warnings.warn(text, stacklevel=2)
     return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
+
+
+def _pairs(lines: Lines, ids: NDArray[np.int64], is_point: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Indices (E, 2) of the poses and points of all edges, which are of the kind that the tags say."""
+    edges, between = lines.edges, slice(lines.between)
+    pairs = lines.indices(edges.lines, edges.ids, ids)
+    is_right = is_point[pairs[:, 1]] == edges.is_point
+    is_known = np.stack([~is_point[pairs[between, 0]], is_right[between]], axis=1)
+    lines.check_known(edges.lines[between], edges.ids[between], is_known)
+    for bad in np.flatnonzero(pairs[between, 0] == pairs[between, 1])[:1]:
+        i, j = edges.ids[bad]
+        raise lines.error(edges.lines[bad], f"edge {i}-{j} joins a vertex to itself; remove it")
+    for bad in np.flatnonzero(~is_right)[:1]:
+        what, other = ("point", "pose") if edges.is_point[bad] else ("pose", "point")
+        text = f"the prior is of a {what}, and vertex {edges.ids[bad, 0]} is a {other}; EDGE_PRIOR_XY is of points"
+        raise lines.error(edges.lines[bad], text)
+    return pairs
 
 
 def _information(rows: Rows, dimension: int, *, is_quaternion: bool) -> Matrix:
@@ -476,16 +506,17 @@ def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Proje
     if not len(bad):
         return None
     (i, j), line = lines.edges.ids[bad[0]], lines.edges.lines[bad[0]]
+    noun, name = ("edge", f"{i}-{j}") if bad[0] < lines.between else ("prior", str(j))
     if indefinite == "refuse":
         raise lines.error(
             line,
-            f"information matrix of edge {i}-{j} is not positive semidefinite, the first of "
+            f"information matrix of {noun} {name} is not positive semidefinite, the first of "
             f"{len(bad):,}; give the upper triangle of an inverse covariance, or have it projected",
         )
     before, nearest = information[bad], nearest_semidefinite(information[bad])
     information[bad] = nearest
     off = np.linalg.norm(nearest - before, axis=(1, 2)) / np.linalg.norm(before, axis=(1, 2))
-    first = f"{i}-{j} in line {line}"
+    first = f"{name} in line {line}"
     projection = Projection(len(bad), len(information), float(np.median(off)), float(off.max()), first)
     warnings.warn(projection.text, stacklevel=3)
     return projection
@@ -496,10 +527,11 @@ def _vertices(lines: Lines) -> tuple[NDArray[np.int64], NDArray[np.bool_], Matri
 
     Without vertex lines the ids are those in the edges, and the poses are the identity.
     """
-    vertices, edges = lines.vertices, lines.edges
+    vertices = lines.vertices
     if not len(vertices.lines):
-        seen = edges.ids[edges.is_point]
-        of_poses, of_points = np.unique(np.append(edges.ids[~edges.is_point], seen[:, 0])), np.unique(seen[:, 1])
+        pairs, to_point = lines.edges.ids[: lines.between], lines.edges.is_point[: lines.between]
+        of_poses = np.unique(np.append(pairs[~to_point], pairs[to_point, 0]))
+        of_points = np.unique(pairs[to_point, 1])
         ids, is_point = np.append(of_poses, of_points), np.arange(len(of_poses) + len(of_points)) >= len(of_poses)
         poses = np.tile(lie.identity(lines.dimension), (len(ids), 1, 1))
     else:

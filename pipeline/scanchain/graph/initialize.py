@@ -28,14 +28,11 @@ def first_guess(
     "auto" keeps the given poses where they fit, else uses the better of them and the chordal relaxation. If there
     may be outliers it always keeps them, since the chordal relaxation is not robust to false loops.
     """
-    fixed, to_point = problem.variable < 0, problem.is_bounded & problem.is_point[problem.edges].any(axis=1)
+    to_point = problem.is_bounded & problem.is_point[problem.edges].any(axis=1)
     if initialize in ("odometry", "spanning-tree"):
-        follow = follow_odometry if initialize == "odometry" else follow_spanning_tree
-        whole = problem.is_whole
-        chained = follow(poses, fixed, problem.edges[whole], problem.measurements[whole])
-        return _with_points(problem, chained, to_point), initialize
+        return _with_points(problem, _by(initialize, problem, poses), to_point), initialize
     if initialize == "chordal":
-        return relax_chordally(problem, poses), initialize
+        return _by("chordal", problem, poses), initialize
     guess, chi2 = poses.copy(), problem.chi2(problem.errors(poses)).sum()
     if initialize == "given":
         return guess, "given"
@@ -47,10 +44,45 @@ def first_guess(
     redundancy = problem.freedom * max(len(problem.edges) - len(problem.free), 1)
     if outlier_free and chi2 > _GOOD_GUESS * redundancy:
         with suppress(SingularMatrixError):
-            relaxed = relax_chordally(problem, poses)
+            relaxed = _by("chordal", problem, poses)
             if problem.chi2(problem.errors(relaxed)).sum() < chi2:
                 return relaxed, "chordal"
     return guess, "given"
+
+
+def _by(method: Initialization, problem: GraphProblem, poses: Matrix) -> Matrix:
+    """Poses by "odometry", "spanning-tree" or "chordal".
+
+    Where no edge measures a rotation relative to a fixed pose, they are computed relative to the first pose and
+    then moved rigidly to the positions that are measured relative to fixed ones (Umeyama 1991).
+    """
+    fixed, d = problem.variable < 0, poses.shape[-1] - 1
+    from_fixed = fixed[problem.edges].any(axis=1)
+    if (from_fixed & problem.is_bounded & problem.information[:, d:].any(axis=(1, 2))).any():
+        return _relative(method, problem, poses)
+    is_anchor = fixed.copy()
+    is_anchor[problem.free[~problem.is_point[problem.free]][:1]] = True
+    rest = ~from_fixed
+    edges = problem.edges[rest], problem.measurements[rest], problem.information[rest]
+    local = GraphProblem(*edges, is_anchor, problem.is_point, problem.kind[rest], problem.factors)
+    result = _relative(method, local, poses)
+    chosen = fixed[problem.edges[:, 0]] & problem.is_bounded
+    i, j = problem.edges[chosen].T
+    seen, found = (poses[i] @ problem.measurements[chosen])[:, :d, d], result[j, :d, d]
+    weight = np.trace(problem.information[chosen, :d, :d], axis1=1, axis2=2)[:, None]
+    share = weight / max(weight.sum(), 1e-300)
+    R = _nearest_rotation((share * (seen - (share * seen).sum(axis=0))).T[None] @ found)[0]
+    result[problem.free, :d, d] = result[problem.free, :d, d] @ R.T + (share * (seen - found @ R.T)).sum(axis=0)
+    turned = problem.free[~problem.is_point[problem.free]]
+    result[turned, :d, :d] = R @ result[turned, :d, :d]
+    return result
+
+
+def _relative(method: Initialization, problem: GraphProblem, poses: Matrix) -> Matrix:
+    if method == "chordal":
+        return relax_chordally(problem, poses)
+    follow, whole = follow_odometry if method == "odometry" else follow_spanning_tree, problem.is_whole
+    return follow(poses, problem.variable < 0, problem.edges[whole], problem.measurements[whole])
 
 
 def _with_points(problem: GraphProblem, poses: Matrix, to_point: NDArray[np.bool_]) -> Matrix:
@@ -106,7 +138,7 @@ def relax_chordally(problem: GraphProblem, poses: Matrix) -> Matrix:
     """Poses (K, d+1, d+1) from two linear least-squares problems (Martinec & Pajdla 2007; Carlone et al. 2015).
 
     Rotations: minimize Σ κ ‖R_j − R_i R_z‖² over any matrices, then take the nearest rotation of each.
-    Translations: minimize Σ τ ‖t_j − t_i − R_i t_z‖². κ and τ are the mean rotational and translational
+    Translations: minimize Σ τ ‖t_j − t_i − R_i t_z‖². κ and τ are the traces of the rotational and translational
     information of the edge, zero for custom factors. The problem's fixed poses keep their values in ``poses``.
     """
     d = poses.shape[-1] - 1

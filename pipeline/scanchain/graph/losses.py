@@ -179,8 +179,14 @@ class RobustLoss:
 
 
 def rejection_limit(scale: float, degrees: int) -> float:
-    """χ² above which a loop edge is an outlier: the kernel's scale², at least the 99.9 % quantile of inliers."""
+    """χ² above which an edge is an outlier: the kernel's scale², at least the 99.9 % quantile of inliers."""
     return max(scale**2, 2.0 * float(gammaincinv(0.5 * degrees, _TRUE_SHARE)))
+
+
+def limit_shares(scale: float, residuals: NDArray[np.int64], freedom: int) -> Array:
+    """``rejection_limit`` of edges with these numbers of residuals (E,), as shares of that of a whole pose."""
+    limits = np.array([rejection_limit(scale, max(count, 1)) for count in range(freedom + 1)])
+    return limits[residuals] / limits[freedom]
 
 
 def robust_loss(kernel: str, scale: float, degrees: int) -> RobustLoss:
@@ -224,9 +230,9 @@ def _check(loss: RobustLoss) -> None:
 
 @dataclass(frozen=True, slots=True)
 class InlierSet:
-    """Inlier set of the loop edges as a loss: an inlier costs its χ², an outlier the price.
+    """Inlier set of the robust edges as a loss: an inlier costs its χ², an outlier the price.
 
-    kept : (L,) bool, inliers among the loop edges
+    kept : (L,) bool, inliers among the robust edges
     price : cost of rejecting an edge, in χ²
     """
 
@@ -243,13 +249,14 @@ class InlierSet:
         return np.where(self.kept, chi2, self.price)
 
 
-def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> float:
+def fair_price(against: Array, nominal: float, residuals: NDArray[np.int64]) -> float:
     """The price, lowered if the distances ``against`` (L,) of kept edges show that the noise model is pessimistic.
 
     With information matrices that are far too small any edge would be accepted. The factor is the median of the
-    distances over that of χ² with this many degrees of freedom, with a margin.
+    distances over that of χ² with as many degrees of freedom as residuals (L,), with a margin.
     """
     if len(against) < _FEWEST:
         return nominal
-    expected = 2.0 * float(gammaincinv(0.5 * degrees, 0.5))
-    return nominal * min(1.0, _MARGIN * float(np.median(against)) / expected)
+    expected = 2.0 * gammaincinv(0.5 * np.maximum(residuals, 1), 0.5)
+    most = float(expected.max())
+    return nominal * min(1.0, _MARGIN * float(np.median(against * (most / expected))) / most)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -42,7 +42,8 @@ class Evaluation:
 class Minimum:
     """Result of a minimization: poses, robust weights (E,), number of linear solves, why it ended, initialization.
 
-    ``price`` is the cost of rejecting a loop edge, in χ²; 0 where the inlier set was not refined.
+    ``price`` is the cost of rejecting an edge that measures a whole pose, in χ²; 0 where the inlier set was not
+    refined.
     """
 
     estimate: Evaluation
@@ -57,8 +58,11 @@ class Minimum:
 class Minimizer:
     """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of robust ones, always with the same step rule."""
 
-    def __init__(self, problem: GraphProblem, optimizer: Optimizer, limits: Limits) -> None:
-        self.problem, self.limits = problem, limits
+    def __init__(
+        self, problem: GraphProblem, optimizer: Optimizer, limits: Limits, shares: NDArray[np.float64]
+    ) -> None:
+        """Shares (E,), as of ``limit_shares``, are the units of χ² of the edges in the truncated loss."""
+        self.problem, self.limits, self.shares = problem, limits, shares
         self.optimizer: Optimizer = optimizer
         self.robust = np.flatnonzero(problem.is_robust)
         self._rule = step_rule(optimizer)
@@ -75,13 +79,17 @@ class Minimizer:
 
     def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
         """The same minimizer for a subset of the edges, kept (E,)."""
-        return Minimizer(self.problem.restricted(kept), self.optimizer, self.limits)
+        return Minimizer(self.problem.restricted(kept), self.optimizer, self.limits, self.shares[kept])
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
         """Robust weight of every edge, (E,); 1 for the quadratic ones."""
         result = np.ones(len(chi2))
-        result[self.robust] = loss.weight(chi2[self.robust])
+        result[self.robust] = loss.weight(chi2[self.robust] / self._units(loss))
         return result
+
+    def graduated(self, chi2: NDArray[np.float64], loss: RobustLoss) -> Iterator[RobustLoss]:
+        """GNC schedule of the loss for edges that begin at these χ² (E,)."""
+        return loss.graduated(chi2[self.robust] / self._units(loss))
 
     def descend(self, now: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
         """Iterate until convergence, by default within ``self.limits``."""
@@ -110,8 +118,13 @@ class Minimizer:
     def _cost(self, chi2: NDArray[np.float64], loss: Loss) -> float:
         if loss.kernel == "none" or not len(self.robust):
             return float(chi2.sum())
-        of_robust = chi2[self.robust]
-        return float(chi2.sum() - of_robust.sum() + loss.loss(of_robust).sum())
+        of_robust, units = chi2[self.robust], self._units(loss)
+        return float(chi2.sum() - of_robust.sum() + (units * loss.loss(of_robust / units)).sum())
+
+    def _units(self, loss: Loss) -> NDArray[np.float64]:
+        """Units (L,) of the χ² of the robust edges in this loss."""
+        shares = self.shares[self.robust]
+        return shares if loss.kernel == "truncated" else np.ones_like(shares)
 
 
 Optimizer = Literal["gauss-newton", "levenberg-marquardt", "gradient-descent"]

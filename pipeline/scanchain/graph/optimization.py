@@ -1,4 +1,4 @@
-"""Optimization of a pose graph by graduated non-convexity that judges all loop edges or new ones; its result."""
+"""Optimization of a pose graph by graduated non-convexity that judges all robust edges or new ones; its result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from scanchain.graph.consistency import Consistency, agreeing_groups
 from scanchain.graph.edge_checks import has_loop, is_connected
 from scanchain.graph.factors import ORIGIN
 from scanchain.graph.initialize import Initialization, first_guess
-from scanchain.graph.losses import InlierSet, RobustLoss, fair_price, rejection_limit, robust_loss
+from scanchain.graph.losses import (
+    InlierSet,
+    RobustLoss,
+    fair_price,
+    limit_shares,
+    rejection_limit,
+    robust_loss,
+)
 from scanchain.graph.minimizer import Evaluation, Limits, Loss, Minimizer, Minimum
 from scanchain.graph.problem import GraphProblem
 
@@ -66,7 +73,7 @@ class Optimization:
 
     state : the graph after the optimization
     chi2_before, chi2_after : Σ w eᵀΩe over the edges in force before and after, each at the poses of that time
-    cost_after : what was minimized: Σ eᵀΩe of all edges, with the robust loss of the loop edges
+    cost_after : what was minimized: Σ eᵀΩe of all edges, with the robust loss of loops and other robust edges
     iterations : linear solves
     converged, reason : whether and why the iteration stopped
     initialization : where the first guess came from
@@ -86,7 +93,10 @@ class Optimization:
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
-        """(E,) bool, in the order of ``state.edges``: loop edges that contradict the rest."""
+        """Edges (E,), in the order of ``state.edges``, with a robust loss that contradict the rest.
+
+        Such edges are loops, ``RobustPrior``, ``RobustPosition`` and custom factors with ``is_robust``.
+        """
         return self.state.is_rejected
 
 
@@ -110,11 +120,13 @@ def solve(
     shift = guess[joined, :-1, -1].mean(axis=0)  # left twists rotate about the origin: move it to the centroid
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
+    limits = _LIMITS if since is not None else Limits(config.max_iterations, config.tolerance)
+    shares = limit_shares(config.robust_scale, problem.residuals, problem.freedom)
+    minimizer = Minimizer(problem, config.optimizer, limits, shares)
     if since is not None:
-        minimum = update(Minimizer(problem, config.optimizer, _LIMITS), guess, loss, since)
+        minimum = update(minimizer, guess, loss, since)
     else:
-        limits = Limits(config.max_iterations, config.tolerance)
-        minimum = minimize(Minimizer(problem, config.optimizer, limits), guess, loss, groups=groups)
+        minimum = minimize(minimizer, guess, loss, groups=groups)
     found = _orthonormal(minimum.estimate.poses)
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0
@@ -154,7 +166,7 @@ def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[
     A loss whose control tends to infinity ends its schedule once all weights are 0 or 1.
     """
     used, focus, final = 0, Focus(minimizer), loss
-    for loss in final.graduated(now.chi2[minimizer.robust]):
+    for loss in minimizer.graduated(now.chi2, final):
         weights = minimizer.weights(now.chi2, loss)
         is_crisp = np.isinf(final.control) and np.all((weights < _CRISP) | (weights > 1.0 - _CRISP))
         if loss == final or is_crisp:
@@ -170,7 +182,7 @@ def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: Robus
     A loss that does not truncate leaves outliers some weight. They keep it if poses would be disconnected without
     them.
     """
-    problem, limit = minimizer.problem, rejection_limit(loss.scale, minimizer.problem.freedom)
+    problem, limit = minimizer.problem, rejection_limit(loss.scale, minimizer.problem.freedom) * minimizer.shares
     rejected = problem.is_robust & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
     if not rejected.any() or not is_connected(problem.edges[~rejected], problem.variable < 0):
         return minimum
@@ -212,13 +224,13 @@ class Focus:
 
 def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: bool) -> Minimum:
     """The minimum with the present inliers, then with those that the other edges do not contradict."""
-    kept, nominal = loss.weight(now.chi2[minimizer.robust]) > 0.5, loss.scale**2
+    kept, nominal = minimizer.weights(now.chi2, loss)[minimizer.robust] > 0.5, loss.scale**2
     minimum = Focus(minimizer).descend(now, InlierSet(kept, nominal))
     problem = minimizer.problem
     if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
         return minimum
     against = _against(minimizer, minimum, nominal)
-    price = fair_price(against[kept], nominal, problem.freedom)
+    price = fair_price(against[kept], nominal, problem.residuals[minimizer.robust][kept])
     minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
     minimum = _refine_edges(minimizer, minimum, against, price)
     if groups:
@@ -232,8 +244,9 @@ def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.fl
     against : (L,) as of ``_against``
     """
     kept, share = minimum.weights[minimizer.robust] > 0.5, 1.0
+    prices = price * minimizer.shares[minimizer.robust]
     for _ in range(_MAX_ROUNDS):
-        gain = np.where(kept, against - price, price - against)
+        gain = np.where(kept, against - prices, prices - against)
         if share < _FEWEST or not (gain > 0.0).any():
             break
         inliers = InlierSet(kept ^ (gain > (1.0 - share) * gain.max()), price)
@@ -286,7 +299,7 @@ def _next_group(
     consistency = Consistency(problem, poses, kept)
     against = consistency.of_each(price)
     for group in (*out, *agreeing_groups(problem, poses, kept, limit)):
-        is_kept, worth, rest = bool(kept[group[0]]), price * len(group), kept.copy()
+        is_kept, worth, rest = bool(kept[group[0]]), price * minimizer.shares[group].sum(), kept.copy()
         rest[group] = False
         if tuple(group.tolist()) in tried or (not is_kept and against[group].max() > worth):
             continue
@@ -300,7 +313,7 @@ def _next_group(
 
 
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
-    """Distance of every loop edge from all other edges, (L,), as of ``Consistency``."""
+    """Distance of every robust edge from all other edges, (L,), as of ``Consistency``."""
     kept = minimum.weights > 0.5
     return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.robust]
 
@@ -342,5 +355,5 @@ def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Sinc
     return [
         group
         for group in (*groups, *np.flatnonzero(left_out)[:, None])
-        if group.max() >= since.updated and consistency.of_group(group) < limit * len(group)
+        if group.max() >= since.updated and consistency.of_group(group) < limit * minimizer.shares[group].sum()
     ]

@@ -29,11 +29,11 @@ from scanchain.graph.edge_checks import (
 from scanchain.graph.explanation import Explainer
 from scanchain.graph.factors import (
     FACTORS,
-    LOOP,
-    LOOP_SIGHTING,
+    LOOPS,
     ODOMETRY,
     ORIGIN,
-    SIGHTING,
+    RELATIVE,
+    WHOLE,
     Factor,
     kinds_of,
     of_residuals,
@@ -155,7 +155,7 @@ class PoseGraph:
     @property
     def is_loop(self) -> NDArray[np.bool_]:
         """True for every loop edge, (E,)."""
-        return (self._kind.rows == LOOP) | (self._kind.rows == LOOP_SIGHTING)
+        return np.isin(self._kind.rows, LOOPS)
 
     @property
     def is_odometry(self) -> NDArray[np.bool_]:
@@ -189,10 +189,10 @@ class PoseGraph:
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
-        """True for every fixed pose, (K,); pose 0 if none was given to ``fix`` and there is no unary factor."""
-        held = np.zeros(len(self), np.bool_)
-        held[sorted(self._fixed) or slice(0, 0 if self._has_origin else 1)] = True
-        return held
+        """True for every fixed pose, (K,); without any by ``fix`` or information on a single pose, pose 0."""
+        result = np.zeros(len(self), np.bool_)
+        result[sorted(self._fixed) or slice(0, 0 if self._rank.rows[self.is_of_origin].any() else 1)] = True
+        return result
 
     @property
     def held(self) -> list[int]:
@@ -246,10 +246,11 @@ class PoseGraph:
             if each is factor or (kind < len(FACTORS) and type(each) is type(factor))
         )
         kind = next(known, len(self._factors))
-        if i == ORIGIN and kind in (ODOMETRY, LOOP, SIGHTING, LOOP_SIGHTING):
-            raise InputError(
-                f"{type(factor).__name__} is measured from another pose; give i, or take Prior or Position"
-            )
+        name = type(factor).__name__
+        if i == ORIGIN and kind in RELATIVE:
+            raise InputError(f"{name} is measured from another pose; give i, or take Prior or Position")
+        if kind in WHOLE and self.is_point[[j if i == ORIGIN else i, j]].any():
+            raise InputError(f"{name} measures a rotation, which points have not; take Position or Sighting")
         if kind == len(self._factors):
             self._factors.append(factor)
         self._extend(*edge, np.array([kind]))
@@ -301,11 +302,7 @@ class PoseGraph:
 
     def fix(self, index: int) -> None:
         """Fix this pose instead of pose 0."""
-        index = checks.integer(index, "index", "the index of a pose")
-        if not 0 <= index < len(self):
-            raise InputError(
-                f"pose {index} cannot be fixed: the graph has {counted(len(self), 'pose')}; add it first"
-            )
+        index = self._checked_index(index, "index")
         self._changed()
         self._fixed.add(index)
 
@@ -422,14 +419,8 @@ class PoseGraph:
 
     def certify(self) -> Certificate:
         """Certificate of the global minimum of χ², with the edge weights of the last optimization."""
-        found = certify(
-            self._prepared(),
-            self._vertices,
-            self._weight_in_force,
-            self._undetermined(),
-            self._of_vertices(self.names, of_origin=ORIGIN),
-        )
-        return replace(found, left_out=self.left_out)
+        graph = self._prepared(), self._vertices, self._weight_in_force
+        return replace(certify(*graph, self._undetermined(), self.names), left_out=self.left_out)
 
     def free_poses(self) -> NDArray[np.int64]:
         """Names of the poses that the edges in force leave free in some direction, at the current poses."""
@@ -463,6 +454,7 @@ class PoseGraph:
         In terms of left twists it is Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ. The factor of H is retained until the
         graph changes, so that each further pair costs k solves.
         """
+        i, j = (self._checked_index(each, name) for each, name in ((i, "i"), (j, "j")))
         adjoint = lie.adjoint(lie.inverse(self.poses[j]))
         return adjoint @ difference_covariances(self._factored(), np.array([[i, j]]))[0, 0] @ adjoint.T
 
@@ -508,6 +500,14 @@ class PoseGraph:
         self._stamps_ns.append(stamp_ns)
         self._is_point.append(is_point)
         return self._poses.append(T_world)
+
+    def _checked_index(self, index: int, name: str) -> int:
+        index = checks.integer(index, name, "the index of a pose")
+        if not 0 <= index < len(self):
+            raise InputError(
+                f"{name} is {index}, and the graph has {counted(len(self), 'pose')}; add the pose first"
+            )
+        return index
 
     def _factored(self) -> GraphProblem:
         """The problem, with the factor of the undamped H in its solver."""

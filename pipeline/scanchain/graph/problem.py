@@ -89,6 +89,11 @@ class GraphProblem:
         return np.array([factor.is_robust for factor in self.factors], np.bool_)[self.kind]
 
     @property
+    def residuals(self) -> NDArray[np.int64]:
+        """Number of residuals of every edge that have information, (E,)."""
+        return np.count_nonzero(np.einsum("eaa->ea", self.information), axis=1)
+
+    @property
     def is_bounded(self) -> NDArray[np.bool_]:
         """True for every edge for whose χ² the certificate has a lower bound, (E,)."""
         return self.kind < len(FACTORS)

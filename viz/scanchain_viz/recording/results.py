@@ -241,15 +241,11 @@ def record_graph(change: GraphChange, path: Path) -> None:
 def _graph(state: GraphState, when: int) -> Iterator[Message]:
     """Nodes, chain, loops and rejected edges at one instant."""
     times, nodes = Times.at(when, when), drawing.positions(state.poses)
-    rejected, skips = state.is_rejected, np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1
-    is_drawn = state.edges[:, 0] >= 0
     yield Message(entities.KEYFRAMES, drawing.dots(nodes, entities.VIOLET, 1.5), times)
-    for entity, chosen, color in (
-        (entities.ODOMETRY_EDGES, ~skips & ~rejected, entities.GRAY),
-        (entities.ACCEPTED, skips & ~rejected, entities.GREEN),
-        (entities.REJECTED, rejected, entities.RED),
-    ):
-        yield Message(entity, drawing.lines(nodes[state.edges[chosen & is_drawn]], color, 0.75), times)
+    names = (entities.ODOMETRY_EDGES, entities.ACCEPTED, entities.REJECTED)
+    colors = (entities.GRAY, entities.GREEN, entities.RED)
+    for entity, edges, color in zip(names, state.drawn_edges, colors, strict=True):
+        yield Message(entity, drawing.lines(nodes[edges], color, 0.75), times)
 
 
 def record_landmarks(studies: Sequence[Study], path: Path) -> None:

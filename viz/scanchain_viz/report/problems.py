@@ -54,15 +54,15 @@ def _graph(state: GraphState) -> Plot:
     figure = Plot.of_plan(low, high)
     if not is_flat:
         figure.x.label, figure.y.label = "seen obliquely from above [m]", ""
-    skips, is_drawn = np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1, state.edges[:, 0] >= 0
+    chain, loops, rejected = state.drawn_edges
     width = float(np.clip(2000.0 / max(len(state.edges), 1), 0.25, 1.0))
-    for chosen, color, thickness, name in (
-        (skips & ~state.is_rejected, _LOOP, width, "between poses that do not follow each other"),
-        (~skips & ~state.is_rejected, _CHAIN, 1.5 * width, "between successive poses"),
-        (state.is_rejected, _REJECTED, width, "rejected"),
+    for edges, color, thickness, name in (
+        (loops, _LOOP, width, "between poses that do not follow each other"),
+        (chain, _CHAIN, 1.5 * width, "between successive poses"),
+        (rejected, _REJECTED, width, "rejected"),
     ):
-        if (chosen & is_drawn).any():
-            figure.line(broken(seen[state.edges[chosen & is_drawn]]), color, thickness, name=name)
+        if len(edges):
+            figure.line(broken(seen[edges]), color, thickness, name=name)
     return figure
 
 
