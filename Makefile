@@ -11,12 +11,12 @@ SCHEMA := $(BIN)/check-jsonschema --quiet --builtin-schema vendor
 PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 INSTALL := VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet
 
-.PHONY: help demo test slow all-tests lint count docs clean
+.PHONY: help demo test slow lint count docs clean
 
 help:
 	@echo "make demo   simulate an office and a town, run both, compare the town with KISS-ICP and Open3D (within four minutes)"
 	@echo "make test   run the tests, but for the slow ones"
-	@echo "make slow   run the slow tests; make all-tests runs both"
+	@echo "make slow   run the slow tests; make test ALL=1 runs both in one session"
 	@echo "make lint   format, lint, type and import checks"
 	@echo "make count  print how many files and lines each part has"
 	@echo "make docs   build the documentation into build/docs; warnings are errors"
@@ -35,13 +35,10 @@ demo: $(BASELINES)
 	@echo "Look at the pictures in runs/, or open the recordings: $(BIN)/scanchain view runs/demo-town"
 
 test: $(DEV)
-	$(PYTEST) -m "not slow"
+	$(PYTEST) $(if $(ALL),,-m "not slow")
 
 slow: $(DEV)
 	$(PYTEST) -m slow
-
-all-tests: $(DEV)
-	$(PYTEST)
 
 lint: $(DEV)
 	$(BIN)/ruff format --check .

@@ -10,9 +10,10 @@ def driver():
         yield scan.points, scan.stamp_ns * 1e-9
 
 
-slam = scanchain.Slam(dimension=2)
+slam = scanchain.Slam(dimension=2, is_live=True)
 for points, stamp_s in driver():
-    step = slam.track(points, stamp_s)  # add T_odom_base=… for wheels, times_s=… for the time of each point
+    scan = scanchain.Scan.of(points, stamp_s)  # add T_odom_base=… for wheels, times_s=… for the time of each point
+    step = slam.process(scan)
     if step.state != "ok":
         print(step.state, step.match.reason)
     T_world_lidar = step.T_world_lidar  # (3, 3); after a loop closure it jumps, T_odom_lidar never does

@@ -19,5 +19,5 @@ print(pixels.shape, free > 10 * occupied > 0)  # -> (362, 442) True
 
 localizer = scanchain.Localizer("runs/office", initial=np.eye(3))  # poses in the frame of the grid
 for scan in scanchain.open_log("office.mcap", end_s=3.0):
-    placed = localizer.track(scan.points, scan.stamp_ns * 1e-9)
+    placed = localizer.process(scan)
 print(placed.state)  # -> localized
