@@ -130,7 +130,7 @@ class Slam:
     @property
     def T_base_lidar(self) -> Pose:
         """Pose of the lidar on the robot, as given or as estimated so far."""
-        return self.front_end.odometry.predictor.mounting.T_base_lidar
+        return self.front_end.odometry.predictor.wheels.mounting.T_base_lidar
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -207,8 +207,8 @@ class Slam:
             state=state,
             components=back_end.closer.segments.components(back_end.graph),
             map_errors=tuple(back_end.errors),
-            warnings=tracking.predictor.warnings(),
-            mounting_note=tracking.predictor.mounting.finish(),
+            warnings=tracking.predictor.wheels.warnings(),
+            mounting_note=tracking.predictor.wheels.mounting.finish(),
             T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,

@@ -259,4 +259,4 @@ def test_scans_that_slip_do_not_convict_the_wheels(tmp_path):
     odometry = Odometry(configured(3), log.T_base_lidar)
     steps = [odometry.process(scan) for scan in islice(log.scans(), 300)]
     assert sum(step.state != "ok" for step in steps) > 100
-    assert odometry.predictor.warnings() == ()
+    assert odometry.predictor.wheels.warnings() == ()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.odometry.prediction import MotionFilter
+from scanchain.odometry.motion_filter import MotionFilter
 
 
 def textbook(any_motion, noise, measurements, information):

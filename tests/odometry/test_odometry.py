@@ -392,6 +392,6 @@ def test_a_jump_of_the_wheels_that_the_scans_contradict_is_left_out(office, jump
     steps, usual = [odometry.process(scan) for scan in jumped], office.tracked(office.scans[:60])
     assert lie.apart(steps[-1].T_odom_lidar, usual[-1].T_odom_lidar)[0] < 0.02
     if jump_m > 1.0:
-        (line,) = odometry.predictor.warnings()
+        (line,) = odometry.predictor.wheels.warnings()
         assert f"jumps by up to {jump_m:.3g} m" in line and "left out at 1 scan (the first: scan 30)" in line
         assert [step.scan.index for step in steps if step.scan.T_odom_base is None] == [30]

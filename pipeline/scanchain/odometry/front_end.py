@@ -52,7 +52,7 @@ class FrontEnd:
         self.inflation = self.nothing  # covariance that contradicted scans add to that of the motion
         self.error_tracker = KeyframeErrorTracker(len(self.nothing))
         self.errors = KeyframeErrors(1.0, self.nothing, 0.0)  # of the last keyframe
-        self.has_wheels = False
+        self.is_measured = False
         self.since_keyframe = 0
         self.lost = 0  # number of scans lost since the keyframe
         self.scans = 0
@@ -105,8 +105,8 @@ class FrontEnd:
         """
         prior, of_match = tracked.prior, tracked.match.information
         self.since_keyframe += 1
-        self.has_wheels |= prior.is_measured
-        if not self.has_wheels:
+        self.is_measured |= prior.is_measured
+        if not self.is_measured:
             self.covariance = None
         T_last, self.T_odom_last = self.T_odom_last, tracked.T_odom_lidar
         is_planar = self.odometry.dimension == 2

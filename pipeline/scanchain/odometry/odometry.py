@@ -161,7 +161,9 @@ class Odometry:
         self._calibrate(points, registered.state)
         match = registered.match if registered.rival is None else spread(registered.match, registered.rival)
         tracked = Tracked(
-            scan=replace(scan, T_odom_base=None) if self.predictor.is_contradicted or scan.clock_jump_s else scan,
+            scan=replace(scan, T_odom_base=None)
+            if self.predictor.wheels.is_contradicted or scan.clock_jump_s
+            else scan,
             points=points,
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
@@ -176,7 +178,7 @@ class Odometry:
         )
         tracked = self._at_stamp(tracked, sweep, prediction)
         is_open = tracked.state is not State.OK
-        self.predictor.mounting.take(tracked.T_odom_lidar, tracked.scan.T_odom_base, is_open=is_open)
+        self.predictor.wheels.mounting.take(tracked.T_odom_lidar, tracked.scan.T_odom_base, is_open=is_open)
         return tracked
 
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:
@@ -199,7 +201,7 @@ class Odometry:
             is_wrong = is_sound(here) and here.cost < CLEARLY * there.cost
         if not is_wrong:
             return prediction
-        self.predictor.drop_wheels(scan, prediction.jump_m)
+        self.predictor.wheels.reject(scan, prediction.jump_m)
         return free
 
     def _register(self, scan: Scan, sweep: Sweep, sparse: Sweep, prediction: Prediction) -> _Registered:
@@ -220,7 +222,7 @@ class Odometry:
         usual_cost = self.recovery.usual_cost
         match, rival = self.recovery.align(points, sweep, self.local_map, prediction)
         is_placed = match.inlier_share >= self.config.matching.min_inlier_share
-        may_stand = self.dimension == 3 and not prediction.prior.is_measured
+        may_stand = self.dimension == 3 and not prediction.source.is_measured
         if is_placed and may_stand and self.standstill.confirms(match):
             match = replace(match, T_target_source=self.standstill.T_odom_lidar)
             return _Registered(points, match, self._judge(match), prediction, is_standing=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from enum import StrEnum
 
 import msgspec
 import numpy as np
@@ -10,13 +11,13 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import OdometryConfig
-from scanchain.data import LEAST_FIT, Match, Matrix, Pose, Prior, Scan, State
-from scanchain.errors import InputError, counted
+from scanchain.data import LEAST_FIT, Match, Pose, Prior, Scan, State
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
 from scanchain.odometry.intervals import Intervals
-from scanchain.registration.hand_eye import MountingEstimator
+from scanchain.odometry.motion_filter import ErrorStatistics, MotionFilter
+from scanchain.odometry.wheels import Wheels
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps are too close
@@ -25,84 +26,27 @@ _ACCELERATION_M_S2 = 4.0  # of a car; limits the search window around the predic
 _FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
 _BURST = 0.05  # of the usual interval: a shorter one is due to a burst and gives no velocity
 _JUMP = 1.0  # m and rad, difference of two motions per scan, above which the wheels may have jumped
-_MEMORY = 0.9  # weight of the mean of the squared errors so far against the next one
-_SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
-_KNOWN = 5  # number of errors needed before the mean is used
-_CAUTION = 2.0  # factor from the root mean square to the standard deviation of the prior
+_MEMORY = 0.9  # weight of the share of doubtful scans so far against the next one
 _MOST_DOUBTFUL = 0.5  # share of lost or contradicted scans, above which scans cannot refute the wheels
-_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation of the prior
 
 
-class ErrorStatistics:
-    """Prediction error statistics: a running mean of squared errors for each component of a twist."""
+class Source(StrEnum):
+    """What predicts the motion to a scan."""
 
-    def __init__(self, first_sigma: NDArray[np.float64]) -> None:
-        """first_sigma : (k,) standard deviations until enough errors are known, and their upper limit."""
-        self.first_sigma = first_sigma
-        self.covariance = np.diag(first_sigma**2)  # (k, k) of the next prediction, conservative
-        self.least = (lie.by_component(len(first_sigma), _LEAST_M, _LEAST_RAD) ** 2).tolist()
-        self.most = (first_sigma**2).tolist()
-        self.squares = [0.0] * len(first_sigma)
-        self.count = 0
+    CONSTANT_VELOCITY = "constant velocity"
+    WHEELS = "wheels"
 
-    def update(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
-        """Add the error (k,) of a prediction against a match, whose variance (k,) is subtracted."""
-        self.count += 1
-        gain = max(1.0 - _MEMORY, 1.0 / self.count)
-        for m, (e, of_match) in enumerate(zip(error.tolist(), variance.tolist(), strict=True)):
-            square = max(e * e - of_match, 0.0)
-            self.squares[m] = max(self.squares[m] + gain * (square - self.squares[m]), _SUDDEN * square)
-        if self.count >= _KNOWN:
-            bounds = zip(self.squares, self.least, self.most, strict=True)
-            self.covariance = np.diag([min(max(_CAUTION**2 * s, least), most) for s, least, most in bounds])
-
-
-class MotionFilter:
-    """Kalman filter at constant velocity: the pose advances by the motion, which changes by noise alone.
-
-    A match measures the pose, and corrects the motion by their cross-covariance: after a slightly wrong match, the
-    next one, which is right again, does not reverse the motion.
-
-    motion : T_previous_current, (d+1, d+1), over one scan
-    pose_covariance, motion_covariance : (k, k) of twists in the lidar's own frame
-    covariance : (k, k) cross-covariance, pose by motion
-    """
-
-    def __init__(self, any_motion: Matrix) -> None:
-        """any_motion : (k, k) covariance of the motion before the first correction."""
-        self.any_motion = any_motion
-        self.nothing = np.zeros_like(any_motion)
-        self.begin(lie.identity(2 if len(any_motion) == 3 else 3))
-
-    def begin(self, motion: Pose) -> None:
-        """Start from a given pose and a motion of covariance ``any_motion``."""
-        self.motion = motion
-        self.motion_covariance = self.any_motion
-        self.pose_covariance = self.covariance = self.nothing
-
-    def correct(self, innovation: NDArray[np.float64], information: Matrix, noise: Matrix) -> None:
-        """Update by a measured pose: its innovation (k,) and information (k, k)."""
-        pose, covariance, motion = self.predicted(noise)
-        known = np.linalg.inv(np.linalg.inv(pose) + information)
-        gain = np.linalg.solve(pose, covariance).T  # of the motion, per correction of the pose
-        self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ innovation))
-        self.pose_covariance = known
-        self.covariance = known @ gain.T
-        self.motion_covariance = motion - gain @ (pose - known) @ gain.T
-
-    def predicted(self, noise: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-        """Covariances (k, k) of the next pose, between pose and motion, and of the motion with its noise added."""
-        motion = self.motion_covariance + noise
-        A = lie.adjoint(lie.inverse(self.motion))
-        covariance = A @ self.covariance
-        pose = A @ self.pose_covariance @ A.T + covariance + covariance.T + motion
-        return pose, covariance + motion, motion
+    @property
+    def is_measured(self) -> bool:
+        """True if a sensor other than the lidar measures the motion."""
+        return self is not Source.CONSTANT_VELOCITY
 
 
 class Prediction(msgspec.Struct, frozen=True):
     """The predicted pose of a scan, and the motion before it, for other initial poses and for deskewing.
 
     prior : predicted pose and its covariance
+    source : what predicts it
     is_guess : whether scans are missing before this one, so that the error may be large
     velocity : (k,) twist per second at the last scan, lidar frame
     T_odom_last, T_previous_current : pose of the last scan, (d+1, d+1), and its motion since the one before
@@ -114,6 +58,7 @@ class Prediction(msgspec.Struct, frozen=True):
     """
 
     prior: Prior
+    source: Source
     is_guess: bool
     velocity: NDArray[np.float64]
     T_odom_last: Pose
@@ -161,7 +106,7 @@ class Prediction(msgspec.Struct, frozen=True):
     @property
     def is_out_of_reach(self) -> bool:
         """True if the gap is so long that the scan may be outside any search window."""
-        return not self.prior.is_measured and self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
+        return not self.source.is_measured and self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
 
     def windows(self) -> tuple[tuple[float, float], ...]:
         """Half widths of the search windows around the predicted pose, the likeliest first, meters and radians.
@@ -225,29 +170,27 @@ class Predictor:
     def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
         """is_mounted : whether ``T_base_lidar`` is known; else it is estimated as the lidar moves."""
         self.config = config
-        self.mounting = MountingEstimator(T_base_lidar, is_stated=is_mounted)
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         k = lie.twist_size(T_base_lidar)
         self.velocity = np.zeros(k)
-        self.by_velocity = ErrorStatistics(lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad))
-        self.by_wheels = ErrorStatistics(lie.by_component(k, config.wheel_sigma_m, config.wheel_sigma_rad))
-        self.filter = MotionFilter(np.diag(self.by_velocity.first_sigma**2))
+        self.wheels = Wheels(config, T_base_lidar, is_mounted=is_mounted)
+        of_velocity = ErrorStatistics(lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad))
+        self.statistics = {Source.CONSTANT_VELOCITY: of_velocity, Source.WHEELS: self.wheels.statistics}
+        self.filter = MotionFilter(np.diag(of_velocity.first_sigma**2))
         self.intervals = Intervals()
         self.lost_s = 0.0
-        self.T_odom_base: Pose | None = None  # by the wheels at the last scan; None where rejected
-        self.is_contradicted = False  # whether the wheel reading at this scan is rejected
         self.scans, self.doubtful = 0, 0.0  # the latter: share of lost or contradicted scans, 1 after a jump
-        self.jumps: list[tuple[int, float]] = []  # scan number and meters of each rejected reading
 
     def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
         """The predicted pose of a scan that follows the last one corrected."""
         times = self.intervals
         interval_s = times.to(scan)
-        wheel, is_guess, jump_m = self._wheel_motion(scan) if by_wheels else None, False, 0.0
-        self.is_contradicted = False
+        wheel = self.wheels.motion(scan) if by_wheels and times.last_scan is not None else None
+        source, is_guess, jump_m = Source.CONSTANT_VELOCITY if wheel is None else Source.WHEELS, False, 0.0
+        self.wheels.is_contradicted = False
         if wheel is not None:
-            motion, covariance = wheel, self.by_wheels.covariance
+            motion, covariance = wheel, self.wheels.statistics.covariance
             scans = max(interval_s / times.usual_s, 1.0) if times.usual_s else 1.0
             if largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
                 jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
@@ -255,11 +198,13 @@ class Predictor:
             motion = _motion_over(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, is_guess = self.filter.any_motion, True
         else:
-            motion, covariance = self.filter.motion, self.filter.predicted(self.by_velocity.covariance)[0]
-        widest = (self.by_velocity if wheel is None else self.by_wheels).first_sigma
+            noise = self.statistics[source].covariance
+            motion, covariance = self.filter.motion, self.filter.predicted(noise)[0]
+        widest = self.statistics[source].first_sigma
         T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(
-            prior=Prior(T_predicted, covariance, widest, is_measured=wheel is not None),
+            prior=Prior(T_predicted, covariance, widest, is_measured=source.is_measured),
+            source=source,
             is_guess=is_guess,
             velocity=self.velocity,
             T_odom_last=self.T_odom_lidar,
@@ -278,21 +223,6 @@ class Predictor:
         """True if most of the last scans were lost or contradicted, or one jumped: they cannot refute wheels."""
         return self.doubtful > _MOST_DOUBTFUL
 
-    def drop_wheels(self, scan: Scan, jump_m: float) -> None:
-        """Reject the reading at this scan, which jumps by ``jump_m``, also for the motion to the next scan."""
-        self.is_contradicted = True
-        self.jumps.append((scan.index, jump_m))
-
-    def warnings(self) -> tuple[str, ...]:
-        """A line on wheel readings that were rejected; none without any."""
-        if not self.jumps:
-            return ()
-        longest_m = max(jump_m for _, jump_m in self.jumps)
-        return (
-            f"wheel odometry jumps by up to {longest_m:.3g} m where the scans fit without it: left out "
-            f"at {counted(len(self.jumps), 'scan')} (the first: scan {self.jumps[0][0]:,})",
-        )
-
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Update by the pose of a scan: that of its match or, if lost, the predicted one."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
@@ -308,8 +238,7 @@ class Predictor:
         if is_known and largest_magnitude(T_odom_lidar - prediction.T_odom_lidar) > _JUMP:
             self.doubtful = 1.0
         self.intervals.take(scan, prediction.interval_s)
-        T_odom_base = None if self.is_contradicted else scan.T_odom_base
-        self.T_odom_base = None if T_odom_base is None else T_odom_base.copy()
+        self.wheels.advance(scan)
         self.T_odom_lidar = T_odom_lidar
 
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:
@@ -321,30 +250,14 @@ class Predictor:
             self.filter.begin(lie.exp(share * lie.log(self.T_previous_current)))
         else:
             innovation = lie.log(lie.between(prediction.T_odom_lidar, match.T_target_source))
-            is_measured, statistics = prediction.prior.is_measured, self.by_velocity
+            is_measured, statistics = prediction.source.is_measured, self.statistics[prediction.source]
             if is_measured:
-                statistics = self.by_wheels
                 self.filter.begin(self.T_previous_current)
             else:
                 self.filter.correct(innovation, match.information, statistics.covariance)
             is_independent = not is_measured or match.observability >= WEAK
             if state is State.OK and is_independent and not prediction.is_second:
                 statistics.update(innovation, definite_inverse(match.information).diagonal())
-
-    def _wheel_motion(self, scan: Scan) -> Pose | None:
-        """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
-        if self.config.prior == "constant-velocity" or self.intervals.last_scan is None or scan.clock_jump_s:
-            return None  # the clock of the wheel readings may have jumped as well
-        last, now = self.T_odom_base, scan.T_odom_base
-        if now is None and self.config.prior == "wheel":
-            raise InputError(
-                f"scan {scan.index} has no wheel odometry although odometry.prior is 'wheel'; "
-                "set log.odometry_topic, or odometry.prior to 'auto'"
-            )
-        if last is None or now is None or not self.mounting.is_usable:
-            return None
-        T_base_lidar = self.mounting.T_base_lidar
-        return lie.between(T_base_lidar, lie.between(last, now).dot(T_base_lidar))
 
 
 def _motion_over(
