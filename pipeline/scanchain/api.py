@@ -19,12 +19,12 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
 from scanchain.runs.closures import closures_table, final_verdicts
+from scanchain.runs.evidence import evidence_of
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.results import cloud_of, expected_of
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.vouching import evidence_of
 from scanchain.settings import load_settings, overrides_of
 from scanchain.verdict import Judged, judge
 

@@ -39,7 +39,8 @@ from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.evaluation.pairing import nearest
-from scanchain.runs.vouching import evidence_of, known_of_run
+from scanchain.runs.evidence import evidence_of
+from scanchain.runs.judging import known_of_run
 from scanchain.trajectory import read_tum
 from scanchain.verdict import judge
 from tests.benchmarks import harness

@@ -18,7 +18,7 @@ from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.logs.formats.clouds import CloudFileError, read_npy
 from scanchain.maps import open_saved_map
 from scanchain.maps.files import write_ply
-from scanchain.runs.vouching import evidence_of_run
+from scanchain.runs.judging import evidence_of_run
 from scanchain.sessions.elsewhere import import_map
 from tests.support import made
 from tests.support.naive_logs import office, write

@@ -16,8 +16,9 @@ from scanchain.data import VERIFICATION, Closure, ClosureVerdict, Match, Proposa
 from scanchain.graph.g2o import read_g2o
 from scanchain.logs import open_log
 from scanchain.loops import ClosureTable
-from scanchain.runs.closures import final_verdicts, write_closures
+from scanchain.runs.closures import closures_table, final_verdicts
 from scanchain.runs.metrics import Metrics
+from scanchain.runs.step_table import write_table
 from scanchain.slam import Slam
 from tests.benchmarks.harness import ate_m
 from tests.support import made
@@ -82,7 +83,7 @@ def test_two_closures_of_the_same_keyframes_each_have_their_own_edge(disturbed):
 
 def test_the_table_says_who_proposed_and_what_the_graph_said(tmp_path, disturbed):
     judged = final_verdicts(disturbed.closures, disturbed.state)
-    write_closures(tmp_path / "loops.parquet", judged, disturbed.keyframes, 2)
+    write_table(tmp_path / "loops.parquet", closures_table(judged, disturbed.keyframes, 2))
     table = pq.read_table(tmp_path / "loops.parquet").to_pydict()
     assert set(table["proposed_by"]) == {str(Proposal.POSITION)}
     for closure, before, after in zip(disturbed.closures, table["chi2_before"], table["chi2_after"], strict=True):

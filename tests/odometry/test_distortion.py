@@ -10,7 +10,7 @@ from scanchain.__main__ import main
 from scanchain.logs import open_log
 from scanchain.logs.messages import point_times
 from scanchain.odometry.distortion import Distortion, choose_point_times, measure_distortion
-from scanchain.runs.vouching import judge_run
+from scanchain.runs.judging import judge_run
 from scanchain.simulation.drive import plan, record
 from tests.support import made
 from tests.support.scenes import shared_data

@@ -18,7 +18,7 @@ from scanchain.landmarks.files import read_landmark_data
 from scanchain.logs.formats.clouds import CloudFileError, read_cloud_file
 from scanchain.maps import Edges, SavedMap, SavedPoints, Session, open_saved_map, write_laz, write_saved_map
 from scanchain.maps.files import read_las
-from scanchain.runs.vouching import evidence_of_run
+from scanchain.runs.judging import evidence_of_run
 from tests.support import made
 from tests.support.fuzzing import within_bounds
 from tests.support.mutations import any_mutant

@@ -148,11 +148,11 @@ def check(
     if trajectory is None:
         if len(sources) != 1 or not isinstance(sources[0], Path) or overrides:
             raise InputError("check takes one run directory; to check a log, name a --trajectory FILE.tum")
-        from scanchain.runs.vouching import judge_run
+        from scanchain.runs.judging import judge_run
 
         judged = judge_run(sources[0])
     else:
-        from scanchain.runs.vouching import judge_trajectory
+        from scanchain.runs.judging import judge_trajectory
 
         judged, missing = judge_trajectory(trajectory, sources, overrides)
         if missing:

@@ -11,10 +11,10 @@ from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, StoredScans
 from scanchain.config import Config
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.runs.closures import final_verdicts, write_closures
+from scanchain.runs.closures import closures_table, final_verdicts
 from scanchain.runs.metrics import METRICS_FILE
 from scanchain.runs.results import expected_of
-from scanchain.runs.step_table import StepTable
+from scanchain.runs.step_table import StepTable, write_table
 from scanchain.slam import Slam
 
 
@@ -39,10 +39,10 @@ class Ours:
         """The final poses; tables go into the folder."""
         self.result = result = self.slam.finish()
         trajectory = result.trajectory if self.has_loops else odometry
-        self.steps.write(folder / STEPS_FILE, trajectory, result.T_base_lidar)
+        write_table(folder / STEPS_FILE, self.steps.table(trajectory, result.T_base_lidar))
         if self.has_loops:
             final = final_verdicts(result.closures, result.state)
-            write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
+            write_table(folder / CLOSURES_FILE, closures_table(final, result.keyframes, odometry.dimension))
         return trajectory
 
     def measure_errors(self, scans: StoredScans, folder: Path) -> None:

@@ -26,10 +26,11 @@ from scanchain.evaluation import ExpectedError
 from scanchain.logs import Log
 from scanchain.maps import write_ply
 from scanchain.processes import Limits
+from scanchain.runs.evidence import evidence_of_trajectory
+from scanchain.runs.judging import judge_run, known_of_run
 from scanchain.runs.provenance import Provenance, package_version
 from scanchain.runs.step_table import COLUMNS as NEES_COLUMNS
 from scanchain.runs.step_table import nees_of_steps, pose_columns
-from scanchain.runs.vouching import evidence_of_trajectory, judge_run, known_of_run
 from scanchain.trajectory import write_tum
 from scanchain.verdict import Judged, Verdict, apart_m, judge
 

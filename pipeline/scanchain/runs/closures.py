@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,15 +41,6 @@ def _loop_edges(state: GraphState) -> defaultdict[tuple[int, int], deque[tuple[f
     for (i, j), weight, chi2 in zip(state.edges[loops], state.weight[loops], state.edge_chi2[loops], strict=True):
         edges[int(i), int(j)].append((float(weight), float(chi2)))
     return edges
-
-
-def write_closures(path: Path, closures: Sequence[Closure], keyframes: Sequence[Keyframe], dimension: int) -> None:
-    """Write the table of ``closures_table``."""
-    import pyarrow.parquet as pq
-
-    pq.write_table(
-        closures_table(closures, keyframes, dimension), path, compression="zstd", write_page_checksum=True
-    )
 
 
 def closures_table(closures: Sequence[Closure], keyframes: Sequence[Keyframe], dimension: int) -> pa.Table:

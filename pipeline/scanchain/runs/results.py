@@ -6,7 +6,9 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -16,7 +18,7 @@ from scanchain import lie
 from scanchain.config import Config, MapsConfig
 from scanchain.data import Closure, Influence, Keyframe, Matrix, Points, Pose, Scan, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import ExpectedErrors, ScanPoses, expected_errors
+from scanchain.evaluation import ExpectedError, ExpectedErrors, ScanPoses, expected_errors
 from scanchain.graph.g2o import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import level_of, outline_of
@@ -39,12 +41,17 @@ from scanchain.maps import (
     write_saved_map,
 )
 from scanchain.odometry.jackknife import influence
-from scanchain.runs.closures import write_closures
+from scanchain.runs.closures import closures_table
+from scanchain.runs.evidence import evidence_of
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
-from scanchain.runs.step_table import StepTable
+from scanchain.runs.step_table import StepTable, write_table
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum
+from scanchain.verdict import Judged, judge
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
 _MOST_SCANS = 20_000  # maximum number of scans, evenly spread over the log, whose errors are estimated
@@ -59,7 +66,7 @@ class Cloud:
     removed: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Results:
     """Everything computed from a log, from which the files of a run directory are written.
 
@@ -76,6 +83,21 @@ class Results:
     drawn: Future[Cloud]
     grid: OccupancyGrid
     T_world_level: Pose
+
+    @cached_property
+    def steps_table(self) -> pa.Table:
+        """The table of the scans."""
+        return self.steps.table(self.result.trajectory, self.result.T_base_lidar)
+
+    @cached_property
+    def closures_table(self) -> pa.Table:
+        """The table of the closures tried."""
+        return closures_table(self.final, self.result.keyframes, self.log.dimension)
+
+    def judged(self, expected: ExpectedError | None) -> Judged:
+        """The verdict on the run."""
+        evidence = evidence_of(self.steps_table, self.closures_table, expected)
+        return judge(evidence, self.result.T_base_lidar, self.log.distortion)
 
     @property
     def cloud(self) -> Cloud:
@@ -190,8 +212,8 @@ def write_results(folder: Path, results: Results) -> None:
     write_g2o(folder / GRAPH_FILE, graph)
     if graph.is_rejected.any():
         write_g2o(rejected_path(folder / GRAPH_FILE), graph, edges="rejected")
-    write_closures(folder / "loops.parquet", results.final, result.keyframes, trajectory.dimension)
-    results.steps.write(folder / "steps.parquet", trajectory, result.T_base_lidar)
+    write_table(folder / "loops.parquet", results.closures_table)
+    write_table(folder / "steps.parquet", results.steps_table)
     write_map(folder, results.grid)
     if config.outputs.map:
         _write_saved_map(folder / MAP_FOLDER, results)

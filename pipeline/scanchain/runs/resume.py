@@ -41,7 +41,7 @@ from scanchain.runs.directory import (
 )
 from scanchain.runs.job import Recorder
 from scanchain.runs.provenance import Provenance, package_version
-from scanchain.runs.step_table import StepTable
+from scanchain.runs.step_table import StepTable, write_table
 from scanchain.settings import flatten
 from scanchain.slam import Slam
 from scanchain.trajectory import write_tum
@@ -314,7 +314,7 @@ def _keep(bug: BaseException | None, folder: Path, steps: StepTable) -> None:
             trace.write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
         if len(steps) and not (folder / "metrics.json").exists():  # else the final results are already written
             write_tum(odometry, steps.trajectory("T_odom_lidar"), force=True)
-            steps.write(table, steps.trajectory("T_world_lidar"))
+            write_table(table, steps.table(steps.trajectory("T_world_lidar")))
     except OSError:
         for path in (odometry, table, trace):
             path.unlink(missing_ok=True)

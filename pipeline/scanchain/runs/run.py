@@ -42,12 +42,11 @@ from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.results import Results, expected_of, record_results, results_of, write_results
 from scanchain.runs.resume import Checkpoints, after, find_left, rescued, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.vouching import evidence_of_run
 from scanchain.settings import Settings, dump, load_settings, named
 from scanchain.slam import Slam, SlamResult
 from scanchain.threads import threads
 from scanchain.trajectory import write_tum, write_wide_tum
-from scanchain.verdict import Judged, judge
+from scanchain.verdict import Judged
 
 _FEW_SCANS = 2  # number of scans up to which a trajectory has at most one motion
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # at these scan stamps; may raise InputError
@@ -188,8 +187,7 @@ class _Run:
             expected = self.expected(result)
             if expected is not None:
                 write_wide_tum(folder / "keyframes.tum", result.keyframe_trajectory, expected.covariances)
-            evidence = evidence_of_run(folder, expected and expected.ate)
-            judged = judge(evidence, result.T_base_lidar, self.log.distortion)
+            judged = results.judged(expected and expected.ate)
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
             with suppress(InputError):  # reported with the accuracy

@@ -14,7 +14,8 @@ from scanchain import lie
 from scanchain.data import Matrix, Pose, State, Step, Trajectory
 from scanchain.evaluation import motion_nees, pair
 from scanchain.graph.growing_array import Columns
-from scanchain.verdict import check_overlap, check_velocity, check_wheels
+from scanchain.runs.evidence import evidence_of
+from scanchain.verdict import CHECKS
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -76,14 +77,8 @@ class StepTable:
         names = self.columns.texts
         return Counter(State(names[code]) for code in self.columns["state"].tolist())
 
-    def write(self, path: Path, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> None:
-        """Write the table; ``trajectory`` has the final poses, ``T_base_lidar`` converts the wheel poses."""
-        import pyarrow.parquet as pq
-
-        pq.write_table(self.table(trajectory, T_base_lidar), path, compression="zstd", write_page_checksum=True)
-
     def table(self, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> pa.Table:
-        """The table, as ``write`` writes it."""
+        """A row per scan; ``trajectory`` has the final poses, ``T_base_lidar`` converts the wheel poses."""
         import pyarrow as pa
 
         steps = self.columns
@@ -92,7 +87,7 @@ class StepTable:
             **{name: steps[name] for name in ("index", "stamp_ns", "log_time_ns")},
             **pose_columns(trajectory.poses),
             **{f"odom_{name}": values for name, values in pose_columns(steps["T_odom_lidar"]).items()},
-            **self._checks(steps, trajectory, T_base_lidar),
+            **({} if T_base_lidar is None else self._wheels(T_base_lidar)),
             "covariance": _lists(covariances, np.isnan(covariances[:, 0, 0])),
             **{name: steps[name] for name in ("scan_points", "dropped", *_OF_MATCH[:5], "cost_m2", "converged")},
             "match_reason": self._texts("match_reason"),
@@ -110,32 +105,35 @@ class StepTable:
             name: pa.array(np.ascontiguousarray(values)) if isinstance(values, np.ndarray) else values
             for name, values in columns.items()
         }
-        return pa.table(arrays)
+        table = pa.table(arrays)
+        evidence = evidence_of(table)
+        for check in CHECKS:
+            if check.column and (not check.source or check.source in evidence.sources):
+                table = table.append_column(check.column, pa.array(check(evidence).values, from_pandas=True))
+        return table
 
-    def _checks(self, steps: Columns, trajectory: Trajectory, T_base_lidar: Pose | None) -> dict[str, object]:
-        """Lidar poses by the wheels, and normalized innovations of the independent checks; null where unknown."""
+    def _wheels(self, T_base_lidar: Pose) -> dict[str, object]:
+        """Lidar poses by the wheels, null where unknown; no columns if they are unknown throughout."""
         import pyarrow as pa
 
-        velocity = check_velocity(trajectory.stamps_ns, steps["log_time_ns"].copy(), trajectory.poses)
-        overlap = check_overlap(inlier_shares(steps))
-        columns: dict[str, object] = {
-            "velocity_innovation": pa.array(velocity, from_pandas=True),
-            "overlap_ratio": pa.array(overlap, from_pandas=True),
-        }
-        known = steps["has_wheels"]
-        if T_base_lidar is None or not known.any():
-            return columns
-        wheels = steps["T_odom_base"] @ T_base_lidar
-        innovation = check_wheels(trajectory.poses, wheels).innovation
-        columns["wheel_innovation"] = pa.array(innovation, from_pandas=True)
-        places = pose_columns(np.where(known[:, None, None], wheels, lie.identity(trajectory.dimension)))
-        return columns | {f"wheel_{name}": pa.array(values, mask=~known) for name, values in places.items()}
+        known, wheels = self.columns["has_wheels"], self.columns["T_odom_base"] @ T_base_lidar
+        if not known.any():
+            return {}
+        poses = pose_columns(np.where(known[:, None, None], wheels, np.eye(wheels.shape[-1])))
+        return {f"wheel_{name}": pa.array(values, mask=~known) for name, values in poses.items()}
 
     def _texts(self, name: str) -> pa.DictionaryArray:
         import pyarrow as pa
 
         names = self.columns.texts
         return pa.array([names[code] for code in self.columns[name].tolist()], pa.string()).dictionary_encode()
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    """Write a table of a run, with checksums."""
+    import pyarrow.parquet as pq
+
+    pq.write_table(table, path, compression="zstd", write_page_checksum=True)
 
 
 def inlier_shares(steps: Columns) -> NDArray[np.float64]:

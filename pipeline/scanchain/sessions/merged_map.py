@@ -22,8 +22,9 @@ from scanchain.errors import InputError
 from scanchain.graph.g2o import write_g2o
 from scanchain.loops import refined, spread
 from scanchain.maps import SavedMap, write_map, write_ply, write_saved_map
-from scanchain.runs.closures import final_verdicts, write_closures
+from scanchain.runs.closures import closures_table, final_verdicts
 from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
+from scanchain.runs.step_table import write_table
 from scanchain.sessions.changes import Label, Part, changes_between
 from scanchain.sessions.joining import Joined, graph_of
 from scanchain.trajectory import read_tum, write_tum
@@ -125,7 +126,7 @@ def write_merged(folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[
     if saved.dimension == 2:
         write_map(folder, grid_of(saved.keyframes, saved.poses, config.maps))
     write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=saved.edges)))
-    write_closures(folder / "loops.parquet", final, saved.keyframes, saved.dimension)
+    write_table(folder / "loops.parquet", closures_table(final, saved.keyframes, saved.dimension))
 
 
 def _refined(joined: Joined, config: Config, held: int) -> Matrix:

@@ -1,22 +1,12 @@
 """Independent checks of a trajectory, and the verdict on it."""
 
-from scanchain.verdict.checks import (
-    VELOCITY_LIMIT,
-    WHEEL_LIMIT,
-    Kind,
-    Stretch,
-    apart_m,
-    check_overlap,
-    check_velocity,
-    check_wheels,
-    smallest_jump_m,
-    wheel_bound_m,
-)
-from scanchain.verdict.judging import MOST_CONTRADICTED, Judged, Verdict, judge
-from scanchain.verdict.stretches import KNOWN, Closures, Evidence
+from scanchain.verdict.checks import CHECKS
+from scanchain.verdict.evidence import Check, Closures, Evidence, Kind, Stretch
+from scanchain.verdict.judging import Judged, Verdict, judge
+from scanchain.verdict.scans import MOST_CONTRADICTED, smallest_jump_m
+from scanchain.verdict.wheels import apart_m
 
 __all__ = [
-    "KNOWN", "MOST_CONTRADICTED", "VELOCITY_LIMIT", "WHEEL_LIMIT", "Closures", "Evidence", "Judged", "Kind",
-    "Stretch", "Verdict", "apart_m", "check_overlap", "check_velocity", "check_wheels", "judge",
-    "smallest_jump_m", "wheel_bound_m",
+    "CHECKS", "MOST_CONTRADICTED", "Check", "Closures", "Evidence", "Judged", "Kind", "Stretch", "Verdict",
+    "apart_m", "judge", "smallest_jump_m",
 ]  # fmt: skip

@@ -21,17 +21,14 @@ from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
-from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
+from scanchain.verdict import CHECKS, Kind, Stretch
 from scanchain_viz.colors import CLOSURES, OPTIMIZED, STRETCH_COLORS, TRUTH, color_of
 from scanchain_viz.pictures.figure import Floats, Line, Plot, broken
 from scanchain_viz.pictures.maps import over_map, surroundings
 from scanchain_viz.pictures.trajectories import column_of, frame, trajectories_of_run
 from scanchain_viz.report import page, sections
 
-_CURVES = (  # a column of steps.parquet, its name, its limit
-    ("wheel_innovation", "wheels", WHEEL_LIMIT),
-    ("velocity_innovation", "constant velocity", VELOCITY_LIMIT),
-)
+_CURVES = [check for check in CHECKS if check.column and np.isfinite(check.limit)]
 _ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the head's unit, digits
     (page.Head("ATE", "m", "rmse"), "ate_rmse_m", 1.0, 4),
     (page.Head("ATE mean", "m"), "ate_mean_m", 1.0, 4),
@@ -144,7 +141,7 @@ def trajectory_lines(
     for kind in _OVER_STATES:
         is_marked = np.zeros(len(steps), bool)
         for each in stretches:
-            is_marked[each.first : each.last + 1] |= each.kind is kind
+            is_marked[each.first : each.last + 1] |= each.kind == kind
         marks.append((str(kind), is_marked, kind))
     for name, is_marked, kind in marks:  # later ones are drawn on top
         if is_marked.any():
@@ -181,14 +178,14 @@ def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
 def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
     """Innovations along the log, relative to their limits, and the stretches to check."""
     figure, chips = Plot("scan", "innovation / limit", is_wide=True), []
-    shaded = [each for each in metrics.stretches if each.kind is not Kind.LOOPS]
+    shaded = [each for each in metrics.stretches if each.kind != Kind.LOOPS]
     for each in shaded:
         figure.span(each.first - 0.5, each.last + 0.5, f"{_SHADE}33")
-    for place, (column, name, limit) in enumerate(_CURVES):
-        if column in steps.column_names:
-            values = np.nan_to_num(column_of(steps, column) / limit)
+    for place, check in enumerate(_CURVES):
+        if check.column in steps.column_names:
+            values = np.nan_to_num(column_of(steps, check.column) / check.limit)
             figure.line(sections.windowed(np.clip(values, *sections.CLIPPED), np.max), color_of(place), 0.9)
-            chips.append(page.Chip(name, color_of(place)))
+            chips.append(page.Chip(check.name, color_of(place)))
     figure.level(1.0)
     chips += [page.Chip("stretches to check", _SHADE)] if shaded else []
     size = sections.window(len(steps))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import VERIFICATION, Matrix, Proposal, Scan, State, Trajectory
-from scanchain.errors import InputError, at_most, one_line
+from scanchain.data import Matrix, Scan, Trajectory
+from scanchain.errors import InputError, one_line
 from scanchain.evaluation import ExpectedError, pair
 from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
@@ -22,25 +21,11 @@ from scanchain.logs import Log, open_log
 from scanchain.odometry.distortion import choose_point_times
 from scanchain.preprocess import Resolution
 from scanchain.registration import MapKeeper, create_matcher
+from scanchain.runs.evidence import evidence_of, evidence_of_trajectory
 from scanchain.runs.metrics import METRICS_FILE
 from scanchain.settings import Override, load_settings
 from scanchain.trajectory import read_tum
-from scanchain.verdict import (
-    KNOWN,
-    Closures,
-    Evidence,
-    Judged,
-    apart_m,
-    check_overlap,
-    check_velocity,
-    check_wheels,
-    judge,
-    smallest_jump_m,
-    wheel_bound_m,
-)
-
-if TYPE_CHECKING:
-    import pyarrow as pa
+from scanchain.verdict import Evidence, Judged, apart_m, judge
 
 _FEWEST = 3  # minimum number of scans with a pose
 
@@ -90,113 +75,6 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
         raise InputError(f"{folder}: has no {name} that can be read{why}; {remedy}") from error
 
 
-def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedError | None = None) -> Evidence:
-    """Evidence of every scan in the tables of a run."""
-    dimension = 2 if steps.schema.field("covariance").type.list_size == 9 else 3
-    poses = poses_of(steps, "", dimension)
-    states = np.array(steps["state"].to_pylist())
-    stamps_ns, log_times_ns = steps["stamp_ns"].to_numpy(), steps["log_time_ns"].to_numpy()
-    wheels = (
-        poses_of(steps, "wheel_", dimension) if "wheel_x" in steps.column_names else np.full_like(poses, np.nan)
-    )
-    return Evidence(
-        seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
-        poses=poses,
-        is_lost=states == State.LOST,
-        is_degenerate=states == State.DEGENERATE,
-        fit=steps["fit"].to_numpy(),
-        starts_segment=steps["starts_segment"].to_numpy(zero_copy_only=False),
-        is_copy=steps["is_copy"].to_numpy(zero_copy_only=False),
-        points=steps["scan_points"].to_numpy(),
-        wheels=check_wheels(poses, wheels),
-        velocity=check_velocity(stamps_ns, log_times_ns, poses),
-        overlap=check_overlap(steps["inliers"].to_numpy() / np.maximum(steps["points"].to_numpy(), 1)),
-        closures=_no_closures(poses) if closures is None else _verified(closures, dimension),
-        odometry=poses_of(steps, "odom_", dimension),
-        error="" if expected is None else f"ATE {expected.bounds}",
-        bound_m=np.inf if expected is None else expected.high,
-        uncertain="" if expected is None else expected.where,
-        open_m=_open_m(steps["residual_m"].to_numpy(), steps["inliers"].to_numpy(), dimension),
-    )
-
-
-def evidence_of_trajectory(
-    trajectory: Trajectory,
-    log_times_ns: NDArray[np.int64],
-    wheels: Matrix,
-    points: NDArray[np.int64],
-    bounds_m: Mapping[str, float] | None = None,
-) -> Evidence:
-    """Evidence of a trajectory without matches: wheels (N, d+1, d+1), NaN where unknown, at the same scans.
-
-    bounds_m : upper bounds on its error, by the name of the other estimate of the same motion that they come
-        from; that from the wheels is added where these are known
-    """
-    n, unknown = len(trajectory), np.zeros(len(trajectory), np.bool_)
-    found = Evidence(
-        seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
-        poses=trajectory.poses,
-        is_lost=unknown,
-        is_degenerate=unknown,
-        fit=np.full(n, np.nan),
-        starts_segment=unknown,
-        is_copy=unknown,
-        points=points,
-        wheels=check_wheels(trajectory.poses, wheels),
-        velocity=check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses),
-        overlap=np.full(n, np.nan),
-        closures=_no_closures(trajectory.poses),
-    )
-    bounds = dict(bounds_m or {})
-    if found.wheels.known_share >= KNOWN:
-        bounds["wheels"] = wheel_bound_m(trajectory.poses, wheels)
-    by = min(bounds, key=bounds.__getitem__, default="")
-    if not by:
-        return replace(found, error=f"no jump above {smallest_jump_m(found.seconds):.2g} m, drift unchecked")
-    return replace(found, error=f"ATE below {at_most(bounds[by])} m by {by}", bound_m=bounds[by])
-
-
-def _open_m(residuals_m: NDArray[np.float64], inliers: NDArray[np.int64], dimension: int) -> float:
-    """Twice the median standard deviation of a position by its residuals, each along one of d directions."""
-    sigmas_m = residuals_m / np.sqrt(np.maximum(inliers, 1) / dimension)
-    known_m = sigmas_m[np.isfinite(sigmas_m)]
-    return 2.0 * float(np.median(known_m)) if len(known_m) else 0.0
-
-
-def _verified(table: pa.Table, dimension: int) -> Closures:
-    """The closures that verification accepted."""
-    rejected_by = np.array(table["rejected_by"].to_pylist(), np.str_)
-    chosen = rejected_by != VERIFICATION
-    by_position = np.array(table["proposed_by"].to_pylist(), np.str_) == Proposal.POSITION
-    return Closures(
-        table["target_scan"].to_numpy()[chosen],
-        table["source_scan"].to_numpy()[chosen],
-        poses_of(table, "", dimension)[chosen],
-        rejected_by[chosen] == "",
-        tried=len(np.unique(table["source_scan"].to_numpy()[by_position])),
-    )
-
-
-def _no_closures(poses: Matrix) -> Closures:
-    nothing = np.empty(0, np.int64)
-    return Closures(nothing, nothing, poses[:0], np.empty(0, np.bool_))
-
-
-def poses_of(table: pa.Table, prefix: str = "", dimension: int = 3) -> Matrix:
-    """Poses (N, d+1, d+1) from the columns whose names begin with ``prefix``, NaN where one is null."""
-    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    values = np.stack(
-        [table[f"{prefix}{name}"].to_numpy(zero_copy_only=False).astype(np.float64) for name in names], axis=1
-    ).reshape(-1, 7)
-    known = np.isfinite(values).all(axis=1)
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    poses[known, :3, :3] = lie.from_quaternion(values[known, 3:])
-    poses[known, :3, 3] = values[known, :3]
-    poses = lie.flatten(poses) if dimension == 2 else poses
-    poses[~known] = np.nan
-    return poses
-
-
 def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Override]) -> tuple[Judged, int]:
     """The verdict on the poses at the scans of a log, and the number of scans without a pose.
 
@@ -225,7 +103,7 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
         evidence_of_trajectory(trajectory, log_times_ns[found], wheels[found], points[found], bounds_m),
         is_lost=inlier_shares < config.matching.min_inlier_share,
         is_degenerate=observability < 1.0,
-        overlap=check_overlap(inlier_shares),
+        inlier_share=inlier_shares,
         fit=fit,
     )
     return judge(evidence, distortion=log.distortion), len(stamps_ns) - len(pairs)
