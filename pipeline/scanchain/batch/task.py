@@ -16,8 +16,8 @@ from msgspec import Struct
 from scanchain.errors import spelled
 from scanchain.files import source_of
 from scanchain.processes import Ending, KilledFor, Limits, run_within
-from scanchain.runs.directory import RUN_FILE
-from scanchain.runs.metrics import METRICS_FILE, Metrics
+from scanchain.runs.directory import METRICS_FILE, RUN_FILE
+from scanchain.runs.metrics import Metrics
 from scanchain.runs.provenance import Provenance, package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.threads import VARIABLE

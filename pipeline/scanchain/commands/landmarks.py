@@ -98,8 +98,6 @@ def landmarks(
       scanchain landmarks 2d_nonlinear.npz --optimizer gauss-newton --out runs/gn --recording gn.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """
-    from msgspec.structs import replace
-
     from scanchain.clock import announcing_compilation
     from scanchain.commands.terminal import Terminal
     from scanchain.landmarks.files import read_landmark_data
@@ -107,7 +105,6 @@ def landmarks(
     from scanchain.landmarks.solvers import parse_methods
     from scanchain.landmarks.study import Options, study_file, study_log
     from scanchain.runs.directory import RunDirectory
-    from scanchain.runs.provenance import describe_start
     from scanchain_viz.report.problems import write_report
 
     chosen = Options(parse_methods(methods), noise=_noise(noise), **more)
@@ -115,7 +112,10 @@ def landmarks(
     _check_options({"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
         options.check_output(recording, force=force, endings=(".rrd",))
-    with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
+    files = [file for path in data for file in (sorted(path.glob("*.dat")) if path.is_dir() else [path])]
+    directory = RunDirectory(out, force=force, sources=files, command=sys.argv)
+    with directory, Terminal("problems") as terminal:
+        directory.begin()
         with announcing_compilation(terminal.say):
             studies = [
                 study_log(each, chosen) if isinstance(each, Path) else study_file(each, chosen)
@@ -126,8 +126,7 @@ def landmarks(
             write_estimate(directory.path, study)
         figures = options.json_text({"problems": [tree_of(study) for study in studies]})
         (directory.path / "metrics.json").write_text(f"{figures}\n", encoding="utf-8")
-        files = [file for path in data for file in (sorted(path.glob("*.dat")) if path.is_dir() else [path])]
-        replace(describe_start(sys.argv, files, ""), complete=True).write(directory.path / "run.json")
+        directory.end()
         write_report(directory.path, studies)
         if recording is not None:
             from scanchain_viz.recording.results import record_landmarks

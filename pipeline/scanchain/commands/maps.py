@@ -198,7 +198,8 @@ def changes(
       scanchain changes runs/a runs/b --transform 1.5,-0.2,180 --out runs/ab
     """
     from scanchain.commands.terminal import Terminal
-    from scanchain.sessions.change_run import SUMMARY_FILE, compare_maps
+    from scanchain.runs.directory import SUMMARY_FILE
+    from scanchain.sessions.change_run import compare_maps
     from scanchain_viz.recording.results import present_changes
 
     if aligned and transform is not None:

@@ -6,9 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 
-import msgspec
 import numpy as np
 
 from scanchain import lie
@@ -25,9 +23,8 @@ from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.odometry.distortion import choose_point_times
 from scanchain.processes import Limits, available_mib
-from scanchain.runs.directory import RUN_FILE, RunDirectory
+from scanchain.runs.directory import RunDirectory
 from scanchain.runs.job import Progress
-from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.settings import Override, load_settings, named
 
 _LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
@@ -86,7 +83,9 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
 
     Raises InputError for bad input before anything is run.
     """
-    began = perf_counter()
+    directory = RunDirectory(
+        comparison.out, force=comparison.force, sources=comparison.logs, command=comparison.command
+    )
     overrides = (*shared_settings(comparison.config_file), *comparison.overrides)
     log = open_log(comparison.logs, load_settings(overrides=overrides).config.log)
     choose_point_times(log)
@@ -98,10 +97,8 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         overrides=comparison.overrides,
         matcher=comparison.matcher,
     )
-    directory = RunDirectory(comparison.out, force=comparison.force)
-    provenance = describe_start(comparison.command, comparison.logs, ", ".join(method.name for method in methods))
-    hashing = Hashing(comparison.logs)
     with directory:
+        directory.begin(", ".join(method.name for method in methods))
         if any(method.is_ours for method in methods):
             compile_ahead([f"{log.dimension}d", "rest"], progress.compiling)
         shared = directory.path / _SHARED
@@ -122,11 +119,8 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         progress.announce("evaluating and drawing")
         results = results_of(methods, scans, outcomes, reference)
         write_results(directory.path, results)
-        provenance = msgspec.structs.replace(
-            provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=perf_counter() - began
-        )
-        provenance.write(directory.path / RUN_FILE)
-        table = summarize(results, log, limits, provenance)
+        directory.end(stopped=stopped)
+        table = summarize(results, log, limits, directory.provenance)
         write_table(directory.path, table)
         shutil.rmtree(shared)
         present(directory.path)

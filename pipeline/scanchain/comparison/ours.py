@@ -12,7 +12,7 @@ from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, StoredScan
 from scanchain.config import Config
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.runs.closures import closures_table, final_verdicts
-from scanchain.runs.metrics import METRICS_FILE
+from scanchain.runs.directory import METRICS_FILE
 from scanchain.runs.results import expected_of
 from scanchain.runs.step_table import StepTable, write_table
 from scanchain.slam import Slam

@@ -1,21 +1,28 @@
-"""The directory a run writes: complete under its own name, or absent, or marked partial."""
+"""The directory of a result and its origin: complete under its own name, or absent, or marked partial."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+import msgspec
 import psutil
 
+from scanchain.clock import working_s
+from scanchain.config import Config
 from scanchain.errors import InputError
+from scanchain.files import Source, write_whole
+from scanchain.runs.provenance import Hashing, describe_start, log_file
+from scanchain.settings import dump
 
-RUN_FILE = "run.json"
+RUN_FILE, CONFIG_FILE = "run.json", "config.toml"
+METRICS_FILE, SUMMARY_FILE = "metrics.json", "summary.txt"
 TRUTH_FILE = "ground_truth.tum"  # ground-truth poses during the run, as given
 CHECKPOINT_FILE = "state.checkpoint"  # of a run that is not complete
 RECORDING_FILE = "recording.rrd"
@@ -24,19 +31,32 @@ _UNFINISHED = "unfinished"
 
 
 class RunDirectory:
-    """A new run directory; a context manager.
+    """The new directory of a run, a localization, a merge or another result; a context manager.
 
     It is written next to its destination, as ``NAME.partial-PID``, and renamed by ``complete``. If the context
     ends before that, it stays where it is if ``worth_keeping`` was called, else it is removed. A directory that is
     replaced stays untouched until the new one is complete.
 
     destination : final path; path : current path
+    left : the directory of a stopped run that is resumed in, instead of an empty one; None for a new one
     """
 
-    def __init__(self, destination: Path, *, force: bool, left: Path | None = None) -> None:
-        """``left`` is a directory marked partial to resume in, instead of an empty one."""
+    def __init__(
+        self, destination: Path, *, force: bool, sources: Sequence[Source] = (), command: Sequence[str] = (),
+        resume: bool = False,
+    ) -> None:  # fmt: skip
+        """Check that the directory may be made, and begin to hash the sources.
+
+        sources, command : what the result is made of, and the command line, for run.json
+        resume : whether to resume in the directory of a stopped run, if there is one
+        Raises InputError for a destination that must not be replaced, and where the run to resume still runs.
+        """
         _check(destination, force)
-        self.left = left
+        self.left = left_behind(destination) if resume else None
+        if self.left is not None and (writer := writer_of(self.left)):
+            raise InputError(f"{self.left}: is being written by process {writer}; wait for its end or stop it")
+        self.began_s = working_s()
+        self.sources, self.provenance, self.hashing = sources, describe_start(command), Hashing(sources)
         self.destination = destination.resolve()
         self.force = force
         self.path = self.destination.with_name(f"{self.destination.name}.partial-{os.getpid()}")
@@ -65,6 +85,25 @@ class RunDirectory:
             error.filename = str(self.destination)
         if self.path != self.destination and not self.is_worth_keeping:
             shutil.rmtree(self.path, ignore_errors=True)
+
+    def begin(self, configuration: str = "", config: Config | None = None) -> None:
+        """Write run.json and the configuration, which is also described in words."""
+        self.provenance = msgspec.structs.replace(
+            self.provenance, configuration=configuration, logs=[log_file(source) for source in self.sources]
+        )
+        self.provenance.write(self.path / RUN_FILE)
+        if config is not None:
+            write_whole(self.path / CONFIG_FILE, dump(config).encode())
+
+    def end(self, *, duration_s: float | None = None, stopped: str = "", is_complete: bool = True) -> None:
+        """Write the final run.json; of a complete result, with the hashes of its sources."""
+        if is_complete:
+            self.provenance = self.provenance.hashed(self.hashing.digests())
+        duration_s = working_s() - self.began_s if duration_s is None else duration_s
+        self.provenance = msgspec.structs.replace(
+            self.provenance, complete=is_complete, stopped=stopped, duration_s=duration_s
+        )
+        self.provenance.write(self.path / RUN_FILE)
 
     def worth_keeping(self) -> None:
         """Retain the directory, marked partial, even if the run fails."""
@@ -100,6 +139,12 @@ class RunDirectory:
         left = [path for path in partial_runs(self.destination) if not writer_of(path)]
         for old in (*left, *self.destination.parent.glob(f"{escape(self.destination.name)}.replaced-*")):
             shutil.rmtree(old, ignore_errors=True)  # also what a killed process left
+
+
+def write_figures(folder: Path, metrics: object, summary: str) -> None:
+    """Write metrics.json, in which values that are not finite become null, and summary.txt."""
+    write_whole(folder / METRICS_FILE, msgspec.json.format(msgspec.json.encode(metrics), indent=2) + b"\n")
+    write_whole(folder / SUMMARY_FILE, summary.encode())
 
 
 def partial_runs(destination: Path) -> list[Path]:

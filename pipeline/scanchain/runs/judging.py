@@ -21,8 +21,8 @@ from scanchain.logs import Log, open_log
 from scanchain.odometry.distortion import choose_point_times
 from scanchain.preprocess import Resolution
 from scanchain.registration import MapKeeper, create_matcher
+from scanchain.runs.directory import METRICS_FILE
 from scanchain.runs.evidence import evidence_of, evidence_of_trajectory
-from scanchain.runs.metrics import METRICS_FILE
 from scanchain.settings import Override, load_settings
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Evidence, Judged, apart_m, judge

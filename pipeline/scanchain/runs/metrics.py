@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
-import msgspec
 import numpy as np
 from msgspec import Struct
 
@@ -20,7 +18,6 @@ from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult
 from scanchain.verdict import Judged, Stretch, Verdict
 
-METRICS_FILE = "metrics.json"
 VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and indent of the reasons below it
 _FIRST = 3  # number of reasons that a terminal shows
 _BY_STAGE = ("ms per scan", "  median", "  95th perc.")  # first words of lines that it omits
@@ -190,10 +187,6 @@ class Metrics(Struct, frozen=True):
         if self.compile_s < _NOTICEABLE_S:
             return ""
         return f" (and {self.compile_s:.0f} s compiling, once after an installation)"
-
-    def write(self, path: Path) -> None:
-        """Write as JSON; values that are not finite become null."""
-        path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
 
 def measure(

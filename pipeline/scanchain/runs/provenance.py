@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from scanchain.errors import InputError
 from scanchain.files import Source, without_keys, write_whole
@@ -53,24 +53,22 @@ class Provenance(Struct, frozen=True):
         """Write as JSON, atomically."""
         write_whole(path, msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
-    def hashed(self, hashing: Hashing) -> Provenance:
-        """Copy with the hashes of its logs; waits until they are computed."""
-        digests = zip(self.logs, hashing.digests(), strict=True)
-        return msgspec.structs.replace(
-            self, logs=[msgspec.structs.replace(file, sha256=sha256) for file, sha256 in digests]
-        )
+    def hashed(self, digests: Sequence[str]) -> Provenance:
+        """Copy with the hashes of its logs."""
+        logs = [structs.replace(file, sha256=digest) for file, digest in zip(self.logs, digests, strict=True)]
+        return structs.replace(self, logs=logs)
 
 
-def describe_start(command: Sequence[str], logs: Sequence[Source], configuration: str) -> Provenance:
-    """Provenance as known when a run starts."""
+def describe_start(command: Sequence[str]) -> Provenance:
+    """Provenance as known when a run starts, without logs and configuration."""
     return Provenance(
         complete=False,
         stopped="",
         command=without_keys(command),
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         duration_s=0.0,
-        logs=[_log_file(source) for source in logs],
-        configuration=configuration,
+        logs=[],
+        configuration="",
         python=platform.python_version(),
         platform=platform.platform(),
         cores=os.cpu_count() or 0,
@@ -78,7 +76,8 @@ def describe_start(command: Sequence[str], logs: Sequence[Source], configuration
     )
 
 
-def _log_file(source: Source) -> LogFile:
+def log_file(source: Source) -> LogFile:
+    """A file or folder that is read, without its hash."""
     if isinstance(source, Path):
         return LogFile(str(source.resolve()), size_of(source), "")
     file = RemoteFile(source)

@@ -20,7 +20,6 @@ from threading import Thread
 from time import perf_counter
 from typing import Any, BinaryIO
 
-import msgspec
 import numpy as np
 
 from scanchain.clock import working_s
@@ -36,11 +35,10 @@ from scanchain.runs.directory import (
     RECORDING_FILE,
     RUN_FILE,
     RunDirectory,
-    left_behind,
-    writer_of,
 )
 from scanchain.runs.job import Recorder
-from scanchain.runs.provenance import Provenance, package_version
+from scanchain.runs.opening import Opened
+from scanchain.runs.provenance import package_version
 from scanchain.runs.step_table import StepTable, write_table
 from scanchain.settings import flatten
 from scanchain.slam import Slam
@@ -73,6 +71,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, every_s: float, left: Checkpoint | None = None) -> None:
         """``left`` is the checkpoint to resume from, whose time of work is added to that of this process."""
+        self.left, self.steps = left, StepTable() if left is None else left.steps
         self.path = folder / CHECKPOINT_FILE
         self.version = _version()
         self.process = 0 if left is None else left.process + 1
@@ -84,6 +83,40 @@ class Checkpoints:
             self.key = _key()
         except InputError as error:
             self.absent = f"no checkpoints, so that --resume would start over: {error.text}"
+
+    def start(self, source: Opened) -> tuple[Slam, Generator[Scan, None, None]]:
+        """SLAM, new or from the checkpoint, and the scans that follow."""
+        folder, left, log = self.path.parent, self.left, source.log
+        scans = log.scans(source.config.preprocess)
+        if left is None:
+            points_file = folder / POINTS_FILE
+            return Slam(source.config, log.stated_mounting, points_file, dimension=log.dimension), scans
+        left.slam.points.reopen(folder / POINTS_FILE)
+        scans = _after(left, scans)
+        _set_aside(folder, left)
+        return left.slam, scans
+
+    def resume(self, recording: Recorder) -> str:
+        """Resume the recording where the last checkpoint left it, if there is one; returns a note about it."""
+        if self.left is None:
+            return ""
+        left, before = self.left, _recorded_by(self.left.process, self.path.parent)
+        is_whole = 0 < left.recorded_bytes <= (before.stat().st_size if before.exists() else 0)
+        if is_whole:
+            os.truncate(before, left.recorded_bytes)
+        recording.resume(
+            before if is_whole else None, left.steps, left.slam.closures, left.slam.back_end.graph.state()
+        )
+        recorded_bytes = recording.secure()
+        self.write(left.slam, left.steps, recorded_bytes)
+        note = f"resumed after {counted(len(left.steps), 'scan')}"
+        if recorded_bytes and is_whole:
+            before.unlink()
+        elif before.exists():
+            note += f"; the recording up to there is {before.name}{'' if is_whole else ', incomplete'}"
+        elif recorded_bytes:
+            note += "; the recording begins there"
+        return note
 
     def are_due(self) -> bool:
         """True when it is time for the next checkpoint."""
@@ -207,21 +240,7 @@ class _Unpickler(pickle.Unpickler):
         return self.left_out[pid]
 
 
-def find_left(out: Path, config: Config) -> Checkpoint | None:
-    """Checkpoint of an earlier run into ``out``; None if there is none.
-
-    config : of this run
-    Raises InputError if the earlier run had another configuration or version, or still runs.
-    """
-    folder = left_behind(out)
-    if folder is None:
-        return None
-    if writer := writer_of(folder):
-        raise InputError(f"{folder}: is being written by process {writer}; wait for its end or stop it")
-    return read_checkpoint(folder, config)
-
-
-def after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Scan, None, None]:
+def _after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Scan, None, None]:
     """The scans after those already processed. Raises InputError if the processed ones differ from the log."""
     names = ("index", "stamp_ns", "log_time_ns", "scan_points", "dropped")
     for index, *known in zip(*(left.steps.columns[name].tolist() for name in names), strict=True):
@@ -231,7 +250,7 @@ def after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Sca
     return scans
 
 
-def set_aside(folder: Path, left: Checkpoint) -> None:
+def _set_aside(folder: Path, left: Checkpoint) -> None:
     """Remove files that will be written again, except the recording, which is renamed.
 
     The new name contains the number of its process, so that it remains if this process is killed before its own
@@ -247,27 +266,6 @@ def set_aside(folder: Path, left: Checkpoint) -> None:
             path.unlink()
 
 
-def resume_recording(folder: Path, left: Checkpoint, recording: Recorder, checkpoints: Checkpoints) -> str:
-    """Resume the recording where the last checkpoint left it; returns a note about it."""
-    before = _recorded_by(left.process, folder)
-    is_whole = 0 < left.recorded_bytes <= (before.stat().st_size if before.exists() else 0)
-    if is_whole:
-        os.truncate(before, left.recorded_bytes)
-    recording.resume(
-        before if is_whole else None, left.steps, left.slam.closures, left.slam.back_end.graph.state()
-    )
-    recorded_bytes = recording.secure()
-    checkpoints.write(left.slam, left.steps, recorded_bytes)
-    note = f"resumed after {counted(len(left.steps), 'scan')}"
-    if recorded_bytes and is_whole:
-        before.unlink()
-    elif before.exists():
-        note += f"; the recording up to there is {before.name}{'' if is_whole else ', incomplete'}"
-    elif recorded_bytes:
-        note += "; the recording begins there"
-    return note
-
-
 def _recorded_by(process: int, folder: Path) -> Path:
     return folder / f"recording.part_{process}.rrd"
 
@@ -279,9 +277,7 @@ def how_to_resume(command: Sequence[str]) -> str:
     return f"to resume: {again}"
 
 
-def rescued(
-    error: BaseException, directory: RunDirectory, steps: StepTable, provenance: Provenance
-) -> BaseException:
+def rescued(error: BaseException, directory: RunDirectory, steps: StepTable) -> BaseException:
     """The error to raise; the results so far are written, and the error names their directory."""
     is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
     directory.worth_keeping()
@@ -293,13 +289,13 @@ def rescued(
     is_or_are = "is" if len(steps) == 1 and not is_bug else "are"
     where = f"{'traceback.txt and the ' if is_bug else ''}{until} {is_or_are} in {directory.path}"
     try:
-        msgspec.structs.replace(provenance, stopped=reason).write(directory.path / RUN_FILE)
+        directory.end(duration_s=0.0, stopped=reason, is_complete=False)
         _keep(error if is_bug else None, directory.path, steps)
     except OSError as failure:
         why = "" if isinstance(error, OSError) else f" ({remedy_of(failure) or failure.strerror})"
         where = f"{until} could not be written to {directory.path}{why}"
     if isinstance(error, KeyboardInterrupt | OSError) and (directory.path / CHECKPOINT_FILE).is_file():
-        where += f"; {how_to_resume(provenance.command)}"
+        where += f"; {how_to_resume(directory.provenance.command)}"
     if isinstance(error, InputError):
         return InputError(f"{error.text}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""

@@ -6,7 +6,6 @@ import csv
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,13 +15,12 @@ from scanchain.config import Config
 from scanchain.data import Pose
 from scanchain.errors import InputError, counted
 from scanchain.maps import SavedMap, write_ply
-from scanchain.runs.directory import RUN_FILE, RunDirectory
-from scanchain.runs.provenance import describe_start
+from scanchain.runs.directory import RunDirectory, write_figures
 from scanchain.sessions.alignment import align_maps, opened_maps
 from scanchain.sessions.changes import Changes, Cluster, Label, Part, changes_between
 from scanchain.settings import load_settings
 
-TABLE_FILE, SUMMARY_FILE, METRICS_FILE = "changes.csv", "summary.txt", "metrics.json"
+TABLE_FILE = "changes.csv"
 COLORS = {
     Label.SAME: (150, 156, 165),
     Label.APPEARED: (26, 161, 121),
@@ -56,7 +54,9 @@ def compare_maps(
     """
     maps = opened_maps(runs, out)
     config = load_settings(maps[0].dimension).config
-    with RunDirectory(out, force=force) as directory:
+    sources = [saved.folder for saved in maps]
+    with RunDirectory(out, force=force, sources=sources, command=command) as directory:
+        directory.begin()
         if len(maps) == 1:
             earlier, later, alignment = *_sessions(maps[0]), "sessions of one map"
         else:
@@ -66,8 +66,7 @@ def compare_maps(
         say("writing")
         _write(directory.path, changes, alignment)
         present(directory.path, changes)
-        provenance = describe_start(command, [saved.folder for saved in maps], "")
-        msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
+        directory.end()
         directory.complete()
     return changes
 
@@ -132,8 +131,7 @@ def _write(folder: Path, changes: Changes, alignment: str) -> None:
         "points": {label.name.lower(): count for label, count in counts.items()},
         "clusters": {"appeared": kinds.count("appeared"), "vanished": kinds.count("vanished"), "moved": moved},
     }
-    (folder / METRICS_FILE).write_bytes(msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
-    (folder / SUMMARY_FILE).write_text(_summary(changes, alignment, counts), encoding="utf-8")
+    write_figures(folder, metrics, _summary(changes, alignment, counts))
 
 
 def _schema(dimension: int) -> pa.Schema:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -24,8 +23,7 @@ from scanchain.maps import MAP_FOLDER, Edges, SavedMap, SavedPoints, Session, wr
 from scanchain.maps.files import read_las
 from scanchain.maps.occupancy_grid import MAX_CELLS
 from scanchain.preprocess import Resolution
-from scanchain.runs.directory import RUN_FILE, RunDirectory
-from scanchain.runs.provenance import describe_start
+from scanchain.runs.directory import RunDirectory
 from scanchain.settings import load_settings
 
 LAS_SUFFIXES, GRID_SUFFIXES = (".laz", ".las"), (".yaml", ".yml")
@@ -90,7 +88,8 @@ def import_map(
     dimension = surfaces.points.shape[1]
     spacing_m = SPACING_M[dimension] if spacing_m is None else spacing_m
     config = load_settings(dimension).config
-    with RunDirectory(out, force=force) as directory:
+    with RunDirectory(out, force=force, sources=[file], command=command) as directory:
+        directory.begin()
         positions = _positions(surfaces, spacing_m, height_m)
         say(f"{counted(len(surfaces.points), 'point')} seen from {counted(len(positions), 'position')}")
         keyframes = tuple(_keyframes(surfaces.points, positions, config))
@@ -106,8 +105,7 @@ def import_map(
         )
         folder = directory.path / MAP_FOLDER
         write_saved_map(SavedMap(folder, dimension, keyframes, np.zeros(count, np.int64), (session,), none))
-        provenance = describe_start(command, [file], "")
-        msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
+        directory.end()
         directory.complete()
     return Imported(dimension, len(surfaces.points), len(keyframes), spacing_m, surfaces.notes)
 

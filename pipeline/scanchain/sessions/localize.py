@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from msgspec import Struct, json, structs
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from scanchain import lie
@@ -20,21 +19,18 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Pose, brief
 from scanchain.errors import InputError, counted
-from scanchain.files import write_whole
 from scanchain.logs import Log
 from scanchain.maps import SavedMap
-from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
+from scanchain.runs.directory import POINTS_FILE, RunDirectory, write_figures
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import GroundTruth, accuracy_lines, verdict_lines
-from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.runs.run import accuracy_of, opened, true_poses
+from scanchain.runs.opening import Opened, opened
 from scanchain.runs.step_table import pose_columns
 from scanchain.sessions.alignment import opened_maps
 from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
 from scanchain.sessions.localizer import Localization, Localizer, MapState
-from scanchain.settings import dump
 from scanchain.trajectory import read_tum, write_tum
-from scanchain.verdict import Verdict
+from scanchain.verdict import Verdict, merged
 
 LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path of a log below which not being found in the map proves nothing
@@ -138,10 +134,10 @@ def localize(
     initial : if known, function of the first scan's stamp and the map that returns T_map_lidar of that scan
     Raises InputError for a log or a map that cannot be read.
     """
-    started = working_s()
+    directory = RunDirectory(job.out, force=job.force, sources=job.logs, command=job.command)
     (prior,) = opened_maps([map_path], job.out)
-    log, settings, truth_file = opened(job)
-    config = settings.config
+    source = opened(job, progress)
+    log, config = source.log, source.config
     if not config.loops.enabled:
         raise InputError("loops.enabled is false, but localization in a map needs loop closures; leave it true")
     if log.dimension != prior.dimension:
@@ -150,24 +146,19 @@ def localize(
             "the same kind"
         )
     progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
-    provenance, hashing = describe_start(job.command, job.logs, settings.source), Hashing(job.logs)
-    with RunDirectory(job.out, force=job.force) as directory:
+    with directory:
+        directory.begin(source.configuration, config)
         compile_ahead([f"{log.dimension}d", "rest"], progress.compiling)
-        provenance.write(directory.path / RUN_FILE)
-        write_whole(directory.path / "config.toml", dump(config).encode())
-        localizer = _tracked(log, prior, config, initial, directory.path / POINTS_FILE, progress)
+        localizer = _tracked(source, prior, initial, directory.path / POINTS_FILE)
         progress.say("smoothing the trajectory")
         found = localizer.finish()
-        stopped = f"stopped by the user after {counted(len(found.states), 'scan')}" if progress.stopped else ""
+        stopped = source.stopped_after(len(found.states))
         warnings = (*filter(None, [stopped]), *log.damage, *localizer.warnings)
-        time_s, truth = working_s() - started, None
+        time_s, truth = working_s() - directory.began_s, None
         progress.say("writing the results")
         with directory.results() as folder:
             if found.is_placed.any():
-                poses = partial(true_poses, log, truth_file, progress)
-                source = str(job.ground_truth or log.ground_truth_topic)
-                placed = replace(found.result, trajectory=found.placed)
-                truth, note = accuracy_of(poses, source, job.max_gap_s, placed, folder)
+                truth, note = source.accuracy(replace(found.result, trajectory=found.placed), folder)
                 warnings += note
             metrics = measure(found, prior, config, time_s, warnings, truth)
             text = _summary(metrics, prior, log, found.result.mounting_note)
@@ -176,20 +167,16 @@ def localize(
             draw(folder, localized)
         localizer.slam.points.close()
         (directory.path / POINTS_FILE).unlink(missing_ok=True)
-        structs.replace(
-            provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=working_s() - started
-        ).write(directory.path / RUN_FILE)
+        directory.end(stopped=stopped)
         directory.complete()
     return localized
 
 
-def _tracked(
-    log: Log, prior: SavedMap, config: Config, initial: Initial | None, points_file: Path, progress: Progress
-) -> Localizer:
+def _tracked(source: Opened, prior: SavedMap, initial: Initial | None, points_file: Path) -> Localizer:
     """The localizer after all scans of the log. Raises InputError if there is no scan."""
-    localizer: Localizer | None = None
+    localizer, log, config = None, source.log, source.config
     with closing(log.scans(config.preprocess)) as scans:
-        for scan in progress.track(scans, log.scan_count):
+        for scan in source.progress.track(scans, log.scan_count):
             if localizer is None:
                 T = None if initial is None else initial(scan.stamp_ns, prior)
                 localizer = Localizer(
@@ -265,8 +252,7 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
         ("place corrected later", wrong, 0.0),
     )
     for kind, chosen, shortest in kinds:
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
-        for begin, end in edges.reshape(-1, 2).tolist():
+        for begin, end in ((part.start, part.stop) for part in merged(chosen, 0)):
             length_m = float(found.traveled_m[end - 1] - found.traveled_m[begin])
             if length_m >= shortest * _WITHOUT_MAP_M[dimension]:
                 yield Part(kind, begin, end - 1, float(seconds[begin]), float(seconds[end - 1]), length_m)
@@ -391,13 +377,12 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) 
 
 
 def _write(folder: Path, localized: LocalizedLog) -> None:
-    """Trajectories, summary, metrics and the table: one row per scan, poses null where unknown."""
+    """Trajectories, summary, metrics and the table: a row per scan, poses null where unknown."""
     found = localized.localization
     if found.is_placed.any():
         write_tum(folder / "trajectory.tum", found.placed)
     write_tum(folder / "odometry.tum", found.result.odometry)
-    (folder / "summary.txt").write_text(localized.summary, encoding="utf-8")
-    (folder / "metrics.json").write_bytes(json.format(json.encode(localized.metrics)) + b"\n")
+    write_figures(folder, localized.metrics, localized.summary)
     columns: dict[str, pa.Array] = {
         "scan": pa.array(np.arange(len(found.states))),
         "stamp_ns": pa.array(found.trajectory.stamps_ns),

@@ -15,18 +15,16 @@ from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
 from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, brief
 from scanchain.errors import InputError, ScanchainError, counted
-from scanchain.files import write_whole
 from scanchain.graph.optimization import fit
 from scanchain.maps import MAP_FOLDER, SavedMap, Session
-from scanchain.runs.directory import RUN_FILE, RunDirectory
+from scanchain.runs.directory import RunDirectory, write_figures
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import removed
-from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.results import Cloud, cloud_of
 from scanchain.sessions.alignment import opened_maps
 from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
-from scanchain.settings import dump, load_settings
+from scanchain.settings import load_settings
 
 
 class SessionMetrics(Session, frozen=True):
@@ -95,7 +93,6 @@ def merge(
     Raises InputError for bad input, and ScanchainError where no two maps belong together.
     """
     started, compiled_before_s = working_s(), compiled_s()
-    directory = RunDirectory(job.out, force=job.force)
     maps = _opened([Path(str(run)) for run in job.logs], job.out)
     if update:
         _check_order([session for saved in maps for session in saved.sessions])
@@ -103,8 +100,9 @@ def merge(
     config, held, folders = settings.config, 0 if fixed else -1, [saved.folder for saved in maps]
     order = _canonical(maps, held)
     names = session_names(maps, order)
-    provenance, hashing = describe_start(job.command, folders, settings.source), Hashing(folders)
+    directory = RunDirectory(job.out, force=job.force, sources=folders, command=job.command)
     with directory, announcing_compilation(progress.say):
+        directory.begin(settings.source, config)
         compile_ahead([f"{maps[0].dimension}d", "rest"], progress.compiling)
         groups, uncertain = join_all(maps, order, [each[0] for each in names], config, held, progress.say)
         joined = _chosen(groups, held, maps, uncertain)
@@ -122,12 +120,9 @@ def merge(
             merged, cloud, final, config, held, apart=apart, uncertain=tuple(uncertain), warnings=warnings,
             updated=update, run_s=run_s, compile_s=compile_s,
         )  # fmt: skip
-        write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
         text = _summary(metrics, names[first][0], settings.source, fixed=fixed)
-        (directory.path / "summary.txt").write_text(text, encoding="utf-8")
-        write_whole(directory.path / "config.toml", dump(config).encode())
-        done = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=run_s + compile_s)
-        done.write(directory.path / RUN_FILE)
+        write_figures(directory.path, metrics, text)
+        directory.end(duration_s=run_s + compile_s)
         progress.say("drawing the report")
         report(directory.path)
         directory.complete()

@@ -22,8 +22,8 @@ from scanchain.graph.optimization import GraphChange
 from scanchain.landmarks.results import file_stem
 from scanchain.landmarks.study import Estimate, Study
 from scanchain.maps import read_ply
-from scanchain.runs.directory import RECORDING_FILE
-from scanchain.sessions.change_run import COLORS, SUMMARY_FILE
+from scanchain.runs.directory import RECORDING_FILE, SUMMARY_FILE
+from scanchain.sessions.change_run import COLORS
 from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.trajectory import read_tum

@@ -14,9 +14,9 @@ from scanchain.config import Config
 from scanchain.data import Matrix
 from scanchain.errors import counted
 from scanchain.maps import read_ply
-from scanchain.runs.directory import RUN_FILE
+from scanchain.runs.directory import METRICS_FILE, RUN_FILE
 from scanchain.runs.provenance import Provenance
-from scanchain.sessions.change_run import COLORS, METRICS_FILE, TABLE_FILE
+from scanchain.sessions.change_run import COLORS, TABLE_FILE
 from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
