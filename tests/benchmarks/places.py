@@ -109,7 +109,7 @@ def outcome(guest: str, host: str, options: argparse.Namespace) -> tuple[str, st
     known = metrics.scans - metrics.states[MapState.SEARCHING]
     word = "followed" if metrics.placed else "held" if known else "refused"
     counts = f"{known:,} of {metrics.scans:,} scans had a pose, {metrics.placed:,} in the end"
-    return word, f"{metrics.sentence} ({counts})"
+    return word, f"{metrics.judged.sentence} ({counts})"
 
 
 def all_pairs(options: argparse.Namespace) -> None:
@@ -248,7 +248,13 @@ def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
     wrong = f"{(live_m[known] > WRONG_M[d]).sum()} of {known.sum()}"
     sigmas = f"{metrics.median_sigma_m:.3f}, {metrics.median_final_sigma_m:.3f}"
     found_there = f"{path_m[entry]:.0f}", f"{inside_m[-1]:.0f}", after, wrong, error, sigmas
-    return name, *found_there, f"{nees[0]:.2f}, {nees[1]:.2f}", f"{spent_s:.0f}", metrics.sentence.split(":")[0]
+    return (
+        name,
+        *found_there,
+        f"{nees[0]:.2f}, {nees[1]:.2f}",
+        f"{spent_s:.0f}",
+        metrics.judged.sentence.split(":")[0],
+    )
 
 
 def main() -> None:

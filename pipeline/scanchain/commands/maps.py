@@ -108,7 +108,7 @@ def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json:
         localized = localize_log(job, prior, terminal, present_localization, initial=first)
     fails = localized.metrics.verdict.fails(strict=strict)
     if fails and as_json:  # otherwise the summary shows the verdict
-        click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
+        click.echo(f"error: {out}: {localized.metrics.judged.sentence}", err=True)
     options.print_summary(out, localized.summary, as_json=as_json)
     return int(fails)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
@@ -21,6 +21,11 @@ from scanchain.verdict import Judged, Stretch, Verdict
 VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and indent of the reasons below it
 _FIRST = 3  # number of reasons that a terminal shows
 _BY_STAGE = ("ms per scan", "  median", "  95th perc.")  # first words of lines that it omits
+_CONDITIONS = {
+    Verdict.TRUSTWORTHY: "",
+    Verdict.CHECK: " if no stretch is wrong",
+    Verdict.NOT_TRUSTWORTHY: " if the trajectory were right",
+}
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
@@ -129,19 +134,6 @@ class Metrics(Struct, frozen=True):
     distortion: str = ""
 
     @property
-    def expected_ate(self) -> str:
-        """Expected ATE as text, with a condition unless the verdict is ``TRUSTWORTHY``."""
-        if self.expected_ate_m is None:
-            return "unknown: the pose graph has no edge, or its edges leave poses free"
-        condition = {
-            Verdict.TRUSTWORTHY: "",
-            Verdict.CHECK: " if no stretch is wrong",
-            Verdict.NOT_TRUSTWORTHY: " if the trajectory were right",
-        }
-        error = self.expected_ate_m
-        return f"{error.mean:.3f} m ({error.bounds})" + condition[self.verdict]
-
-    @property
     def refuted(self) -> str:
         """Message that the ATE against the ground truth is outside of the error bar; empty if it is not."""
         bar, truth = self.expected_ate_m, self.ground_truth
@@ -158,35 +150,6 @@ class Metrics(Struct, frozen=True):
     def sentence(self) -> str:
         """The verdict in words."""
         return self.judged.sentence
-
-    @property
-    def residual(self) -> str:
-        """Median residual of matching as text."""
-        return "–" if self.median_residual_m is None else f"{1e3 * self.median_residual_m:.1f} mm"
-
-    @property
-    def fit(self) -> str:
-        """χ² of the pose graph as text."""
-        count = self.closures_rejected_by_back_end
-        rejected = f"{counted(count, 'closure')} rejected by the back end" if count else ""
-        return fit_text(self.chi2, self.degrees_of_freedom, rejected, has_loops=self.closures_accepted > 0)
-
-    @property
-    def closures(self) -> str:
-        """Loop closures tried, rejected and accepted, as text."""
-        if not self.closures_tried:
-            return "none tried"
-        return (
-            f"{self.closures_tried:,} tried: {self.closures_rejected_by_verification:,} rejected by verification, "
-            f"{self.closures_rejected_by_back_end:,} by the back end, {self.closures_accepted:,} accepted"
-        )
-
-    @property
-    def compiling(self) -> str:
-        """Compilation time as text; empty if kernels came from the cache."""
-        if self.compile_s < _NOTICEABLE_S:
-            return ""
-        return f" (and {self.compile_s:.0f} s compiling, once after an installation)"
 
 
 def measure(
@@ -287,36 +250,64 @@ def removed(points: int) -> str:
     return f"; {counted(points, 'point')} of moving objects removed" if points else ""
 
 
+def lines_of(m: Metrics) -> Iterator[tuple[str, str]]:
+    """Label and text of each figure, for summary and report, without accuracy and times by stage."""
+    states = {"ok": m.ok, "contradicted": m.contradicted, "degenerate": m.degenerate, "lost": m.lost}
+    counts = ", ".join(f"{count:,} {state}" for state, count in states.items())
+    yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s: {counts}"
+    if m.dropped_points:
+        yield "points", f"{counted(m.dropped_points, 'invalid return')} left out"
+    at_rest = ": the noise of one that does not move" if "does not move" in m.verdict_reason else ""
+    yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}{at_rest}"
+    if (error := m.expected_ate_m) is None:
+        yield "expected ATE", "unknown: the pose graph has no edge, or its edges leave poses free"
+    else:
+        yield "expected ATE", f"{error.mean:.3f} m ({error.bounds}){_CONDITIONS[m.verdict]}"
+    by_back_end = m.closures_rejected_by_back_end
+    yield (
+        "loop closures",
+        f"{m.closures_tried:,} tried: {m.closures_rejected_by_verification:,} rejected by verification, "
+        f"{by_back_end:,} by the back end, {m.closures_accepted:,} accepted"
+        if m.closures_tried
+        else "none tried",
+    )
+    rejected = f"{counted(by_back_end, 'closure')} rejected by the back end" if by_back_end else ""
+    yield "pose graph", fit_text(m.chi2, m.degrees_of_freedom, rejected, has_loops=m.closures_accepted > 0)
+    yield "map", f"{counted(m.map_points, 'point')}{removed(m.moving_points_removed)}"
+    residual = "–" if m.median_residual_m is None else f"{1e3 * m.median_residual_m:.1f} mm"
+    inliers, iterations = 100.0 * m.median_inlier_share, counted(round(m.median_iterations), "iteration")
+    yield "matching", f"inliers {inliers:.0f} %, residual {residual}, {iterations} (medians)"
+    if m.range_noise_m:
+        yield "lidar noise", m.range_noise
+    if m.elevation_offset_rad and m.elevation_sigma_rad is not None:
+        by_deg, sigma_deg = math.degrees(m.elevation_offset_rad), math.degrees(m.elevation_sigma_rad)
+        angles = f"vertical angles corrected by {by_deg:+.2f} ± {sigma_deg:.2f} deg"
+        yield "calibration", f"{angles} from scan {m.calibrated_from:,} on (preprocess.calibrate_elevation)"
+    yield from (("odometry", error) for error in m.odometry_errors)
+    compiling = f" (and {m.compile_s:.0f} s compiling, once after an installation)"
+    took = f"{m.run_s:.1f} s{compiling if m.compile_s >= _NOTICEABLE_S else ''} with map and results"
+    yield "time", f"{took}, {counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time"
+
+
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
     """The metrics as text."""
-    m = metrics
-    lines = [
-        *verdict_lines(m.judged.headline, m.judged.reasons),
-        heading,
-        f"configuration  {configuration}",
-        f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, "
-        f"{m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost",
-        *([f"points         {counted(m.dropped_points, 'invalid return')} left out"] if m.dropped_points else []),
-        f"trajectory     {m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}{_at_rest(m)}",
-        f"expected ATE   {m.expected_ate}",
-        f"loop closures  {m.closures}",
-        f"pose graph     {m.fit}",
-        f"map            {counted(m.map_points, 'point')}{removed(m.moving_points_removed)}",
-        f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
-        f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
-        *([f"lidar noise    {m.range_noise}"] if m.range_noise_m else []),
-        *_calibration_lines(m),
-        *(f"odometry       {error}" for error in m.odometry_errors),
-        f"time           {m.run_s:.1f} s{m.compiling} with map and results, "
-        f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time",
-        "ms per scan    " + "".join(f"{stage:>12}" for stage in STAGES),
-        "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
-        "  95th perc.   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),
-    ]
-    if m.ground_truth is not None:
-        lines += accuracy_lines(m.ground_truth)
-    lines += [f"warning        {warning}" for warning in m.warnings]
-    return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
+    stages = {"median": metrics.median_ms, "95th perc.": metrics.p95_ms}
+    return text_of(metrics.judged, [
+        ("", heading),
+        ("configuration", configuration),
+        *lines_of(metrics),
+        (_BY_STAGE[0], "".join(f"{stage:>12}" for stage in STAGES)),
+        *((f"  {name}", "".join(f"{of[stage]:12.2f}" for stage in STAGES)) for name, of in stages.items()),
+        *accuracy_lines(metrics.ground_truth),
+        *(("warning", warning) for warning in metrics.warnings),
+        *(("note", note) for note in notes),
+    ])  # fmt: skip
+
+
+def text_of(judged: Judged | None, lines: Iterable[tuple[str, str]]) -> str:
+    """The text of summary.txt: the verdict with its reasons, and a line for each label and text."""
+    first = [] if judged is None else verdict_lines(judged.headline, judged.reasons)
+    return "\n".join([*first, *(f"{label:<14} {text}" if label else text for label, text in lines)]) + "\n"
 
 
 def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
@@ -341,32 +332,18 @@ def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
     return accuracy, ate.path_length_m
 
 
-def accuracy_lines(truth: GroundTruth) -> list[str]:
-    """Lines of text that state the accuracy."""
+def accuracy_lines(truth: GroundTruth | None) -> Iterator[tuple[str, str]]:
+    """Label and text of the accuracy, if there is ground truth."""
+    if truth is None:
+        return
     missing = f"; {truth.optimized.missing}" if truth.optimized.missing else ""
-    lines = [
-        f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, "
-        f"{counted(truth.optimized.pairs, 'scan')}{missing}"
-    ]
-    for name, accuracy in (("ATE", truth.optimized), ("ATE odometry", truth.odometry)):
-        share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
+    scans = counted(truth.optimized.pairs, "scan")
+    yield "ground truth", f"{truth.source}: {truth.path_length_m:.1f} m, {scans}{missing}"
+    for name, error in (("ATE", truth.optimized), ("ATE odometry", truth.odometry)):
+        share = error.ate_share_of_path
         of_path = "" if share is None else f" ({100.0 * share:.3f} % of the path)"
-        lines.append(
-            f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m{of_path}, "
-            f"max {accuracy.ate_max_m:.4f} m, rotation rmse {rotation:.3f} deg"
+        yield (
+            name,
+            f"rmse {error.ate_rmse_m:.4f} m{of_path}, max {error.ate_max_m:.4f} m, "
+            f"rotation rmse {np.degrees(error.ate_rotation_rmse_rad):.3f} deg",
         )
-    return lines
-
-
-def _at_rest(m: Metrics) -> str:
-    return ": the noise of one that does not move" if "does not move" in m.verdict_reason else ""
-
-
-def _calibration_lines(m: Metrics) -> list[str]:
-    if not m.elevation_offset_rad or m.elevation_sigma_rad is None:
-        return []
-    offset_deg, sigma_deg = math.degrees(m.elevation_offset_rad), math.degrees(m.elevation_sigma_rad)
-    return [
-        f"calibration    vertical angles corrected by {offset_deg:+.2f} ± {sigma_deg:.2f} deg from scan "
-        f"{m.calibrated_from:,} on (preprocess.calibrate_elevation)"
-    ]

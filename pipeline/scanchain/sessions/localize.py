@@ -23,14 +23,14 @@ from scanchain.logs import Log
 from scanchain.maps import SavedMap
 from scanchain.runs.directory import POINTS_FILE, RunDirectory, write_figures
 from scanchain.runs.job import Job, Progress
-from scanchain.runs.metrics import GroundTruth, accuracy_lines, verdict_lines
+from scanchain.runs.metrics import GroundTruth, accuracy_lines, text_of
 from scanchain.runs.opening import Opened, opened
 from scanchain.runs.step_table import pose_columns
 from scanchain.sessions.alignment import opened_maps
 from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
 from scanchain.sessions.localizer import Localization, Localizer, MapState
 from scanchain.trajectory import read_tum, write_tum
-from scanchain.verdict import Verdict, merged
+from scanchain.verdict import Judged, Verdict, merged
 
 LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path of a log below which not being found in the map proves nothing
@@ -99,9 +99,9 @@ class LocalizeMetrics(Struct, frozen=True):
     ground_truth: GroundTruth | None = None
 
     @property
-    def sentence(self) -> str:
+    def judged(self) -> Judged:
         """Verdict and reason."""
-        return f"{self.verdict}: {self.reason}"
+        return Judged(self.verdict, self.reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,36 +344,35 @@ def pose_in_file(path: Path) -> Initial:
     return pose
 
 
+def lines_of(m: LocalizeMetrics) -> Iterator[tuple[str, str]]:
+    """Label and text of each figure, for summary and report."""
+    states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
+    yield "states", f"{states}; {m.placed:,} placed in the end"
+    if m.found_scan >= 0:
+        yield "found", f"at scan {m.found_scan:,}, after {m.found_after_s:.1f} s and {m.found_after_m:.1f} m"
+    if m.found_scan >= 0 and np.isfinite(m.log_odds):
+        yield "evidence", f"log-odds of {m.log_odds:.0f} that this location is right"
+    if m.matches:
+        left_out = f", {m.rejected:,} of them rejected" if m.rejected else ""
+        yield "matches", f"{m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)"
+        sigmas = f"{m.median_sigma_m:.3f} m live, {m.median_final_sigma_m:.3f} m final"
+        yield "sigma", f"{sigmas}: standard deviation of a position (median)"
+    yield from accuracy_lines(m.ground_truth)
+
+
 def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) -> str:
     """Text of summary.txt."""
     names = ", ".join(session.name for session in prior.sessions)
-    states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
-    lines = [
-        *verdict_lines(m.verdict, m.reason.split("; ")),
-        f"log            {', '.join(map(str, log.paths))} {log.topic}: "
-        f"{counted(m.scans, 'scan')} over {m.path_m:.1f} m",
-        f"map            {prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}",
-        f"states         {states}; {m.placed:,} placed in the end",
-    ]
-    if m.found_scan >= 0:
-        at = f"{m.found_after_s:.1f} s and {m.found_after_m:.1f} m"
-        lines.append(f"found          at scan {m.found_scan:,}, after {at}")
-    if m.found_scan >= 0 and np.isfinite(m.log_odds):
-        lines.append(f"evidence       log-odds of {m.log_odds:.0f} that this location is right")
-    if m.matches:
-        left_out = f", {m.rejected:,} of them rejected" if m.rejected else ""
-        lines += [
-            f"matches        {m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)",
-            f"sigma          {m.median_sigma_m:.3f} m live, {m.median_final_sigma_m:.3f} m final: "
-            "standard deviation of a position (median)",
-        ]
-    if m.ground_truth is not None:
-        lines += accuracy_lines(m.ground_truth)
-    lines += [f"stretch        {part.text}" for part in m.parts]
-    lines += [f"warning        {warning}" for warning in m.warnings]
-    lines += [f"note           {note}" for note in (*log.notes, mounting_note) if note]
-    lines.append(f"time           {m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s")
-    return "\n".join(lines) + "\n"
+    paths, scans = ", ".join(map(str, log.paths)), counted(m.scans, "scan")
+    return text_of(m.judged, [
+        ("log", f"{paths} {log.topic}: {scans} over {m.path_m:.1f} m"),
+        ("map", f"{prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}"),
+        *lines_of(m),
+        *(("stretch", part.text) for part in m.parts),
+        *(("warning", warning) for warning in m.warnings),
+        *(("note", note) for note in (*log.notes, mounting_note) if note),
+        ("time", f"{m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s"),
+    ])  # fmt: skip
 
 
 def _write(folder: Path, localized: LocalizedLog) -> None:

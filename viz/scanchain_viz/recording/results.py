@@ -193,7 +193,7 @@ def present_localization(directory: Path, localized: LocalizedLog) -> None:
         Message(entities.MAP, drawing.dots(points, entities.height_colors(points), 1.0)),
         Message(entities.LIDAR, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
         Message(entities.SCAN, drawing.dots(color=entities.YELLOW, radius=2.0)),
-        Message(entities.VERDICT, rr.TextDocument(localized.metrics.sentence)),
+        Message(entities.VERDICT, rr.TextDocument(localized.metrics.judged.sentence)),
         Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.BLUE])),
         Message(entities.STATE, rr.StateConfiguration(values=names, labels=names, colors=colors)),
         *_localized(localized),

@@ -18,10 +18,9 @@ from scanchain.runs.directory import METRICS_FILE, RUN_FILE
 from scanchain.runs.provenance import Provenance
 from scanchain.sessions.change_run import COLORS, TABLE_FILE
 from scanchain.sessions.changes import Changes, Label
-from scanchain.sessions.localize import LocalizedLog
+from scanchain.sessions.localize import LocalizedLog, lines_of
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
-from scanchain.verdict import Judged
 from scanchain_viz.colors import CLOSURES
 from scanchain_viz.pictures import maps
 from scanchain_viz.pictures.figure import INK, Line, Plot, broken
@@ -110,19 +109,10 @@ def _sessions(drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
 def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
     """Write the page into a folder."""
     m = localized.metrics
-    facts = (
-        ("scans", f"{m.scans:,} over {m.path_m:.1f} m"),
-        ("placed", f"{m.placed:,}, {100.0 * m.placed / max(m.scans, 1):.1f} %"),
-        ("found", f"after {m.found_after_m:.1f} m, {m.found_after_s:.1f} s" if m.found_scan >= 0 else "no"),
-        ("matches with the map", f"{m.matches:,}, {m.rejected:,} rejected"),
-        ("overlap", f"{m.median_overlap:.2f} (median)" if m.matches else "none"),
-        ("standard deviation", f"{m.median_final_sigma_m:.3f} m (median)" if m.matches else "unknown"),
-        ("log-odds of the location", f"{m.log_odds:.0f}" if np.isfinite(m.log_odds) else "none"),
-        *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
-    )
+    facts = [("scans", f"{m.scans:,} over {m.path_m:.1f} m"), *lines_of(m)]
     subtitle = f"{localized.path.name} in the map {localized.prior.name}"
-    sections, judged = list(_localized(localized)), Judged(m.verdict, m.reason)
-    page.write_page(folder, page.Page("Localization", subtitle, facts, m.warnings, (), sections, judged=judged))
+    sections = list(_localized(localized))
+    page.write_page(folder, page.Page("Localization", subtitle, facts, m.warnings, (), sections, judged=m.judged))
 
 
 def _localized(localized: LocalizedLog) -> Iterator[page.Section]:

@@ -16,7 +16,7 @@ from scanchain.data import BACK_END, Points
 from scanchain.errors import counted
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
-from scanchain.runs.metrics import REASON, VERDICT, GroundTruth, Metrics
+from scanchain.runs.metrics import REASON, VERDICT, GroundTruth, Metrics, accuracy_lines, lines_of
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
@@ -66,29 +66,14 @@ def write_run_report(directory: Path) -> None:
     page.write_page(directory, whole)
 
 
-def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
-    """Facts of a run: the result first, its cost last."""
-    yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
-    yield "accuracy", _accuracy(m)
-    yield "expected ATE", m.expected_ate
-    yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
-    yield "state", f"{m.ok:,} ok, {m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost"
-    yield "pose graph", m.fit
-    yield "loop closures", m.closures
-    yield "matching", f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)"
-    yield "map", counted(m.map_points, "point")
+def _facts(metrics: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
+    """Label and text of the figures, and the origin of the run."""
+    yield from lines_of(metrics)
+    accuracy = dict(accuracy_lines(metrics.ground_truth))
+    yield "ATE", accuracy.get("ATE", "unknown: no ground truth")
     yield "configuration", made.configuration
-    yield "speed", f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} × real time{m.compiling}"
     yield "machine", f"{made.platform}, {made.cores} cores"
     yield "made", sections.when(made)
-
-
-def _accuracy(m: Metrics) -> str:
-    if m.ground_truth is None:
-        return "unknown: no ground truth"
-    error = m.ground_truth.optimized
-    share = "" if error.ate_share_of_path is None else f", {100.0 * error.ate_share_of_path:.3f} % of the path"
-    return f"ATE {error.ate_rmse_m:.4f} m{share}"
 
 
 def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
