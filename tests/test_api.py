@@ -55,8 +55,8 @@ def test_a_log_has_a_length_and_scans_and_slam_gives_the_cloud_and_the_verdict_o
     assert "recording.rrd" not in written
     with pytest.raises(InputError, match=r"did you mean loops__drift\?"):
         sc.run(office, tmp_path / "again", loops__driff=0.1)
-    assert result.verdict().sentence == done.metrics.sentence
-    assert len(result.cloud()) == done.metrics.map_points
+    assert sc.judge(result).sentence == done.metrics.sentence
+    assert len(sc.cloud(result)) == done.metrics.map_points
     assert done.accuracy.ate_rmse_m == done.metrics.ground_truth.optimized.ate_rmse_m
     untrue = sc.run(office, tmp_path / "untrue", recording=False, log__ground_truth_topic="none")
     with pytest.raises(InputError, match="no ground truth; name a file by ground_truth"):

@@ -22,4 +22,4 @@ print(T_world_lidar[:2, 2].round(2))  # -> [ 4.36 -3.09]
 result = slam.finish()  # closes the last loops and corrects every scan
 scanchain.write_tum("trajectory.tum", result.trajectory)
 print(result.trajectory)  # -> Trajectory(100 poses of SE(2) over 9.9 s)
-print(result.verdict().verdict, result.cloud().shape[1])  # -> trustworthy 2
+print(scanchain.judge(result).verdict, scanchain.cloud(result).shape[1])  # -> trustworthy 2

@@ -11,11 +11,11 @@ if TYPE_CHECKING:  # "as" says that the name is public here
 
     from scanchain import evaluation as evaluation
     from scanchain import lie as lie
-    from scanchain.api import Slam as Slam
-    from scanchain.api import SlamResult as SlamResult
     from scanchain.api import changes as changes
+    from scanchain.api import cloud as cloud
     from scanchain.api import compare as compare
     from scanchain.api import downsample as downsample
+    from scanchain.api import judge as judge
     from scanchain.api import localize as localize
     from scanchain.api import merge as merge
     from scanchain.api import optimize as optimize
@@ -41,13 +41,15 @@ if TYPE_CHECKING:  # "as" says that the name is public here
     from scanchain.sessions.localizer import Localizer as Localizer
     from scanchain.settings import load_settings as load_settings
     from scanchain.simulation import simulate as simulate
+    from scanchain.slam import Slam as Slam
+    from scanchain.slam import SlamResult as SlamResult
     from scanchain.trajectory import read_tum as read_tum
     from scanchain.trajectory import write_tum as write_tum
 
     __version__: str
 
 _MODULES = {
-    "api": "Slam SlamResult changes compare downsample localize merge optimize run",
+    "api": "changes cloud compare downsample judge localize merge optimize run",
     "config": "Config",
     "data": "Match Scan State Step Trajectory",
     "errors": "InputError ScanchainError",
@@ -61,6 +63,7 @@ _MODULES = {
     "sessions.localizer": "Localizer",
     "settings": "load_settings",
     "simulation": "simulate",
+    "slam": "Slam SlamResult",
     "trajectory": "read_tum write_tum",
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}

@@ -1,19 +1,15 @@
-"""The commands as functions, and SLAM on scans from any source, with the map and the verdict of a run."""
+"""The commands as functions, and the map and verdict of a SLAM result as of a run."""
 
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scanchain import checks
-from scanchain import slam as core
-from scanchain.config import Config
-from scanchain.data import AnyPoints, Points, Pose, Scan, Step, brief
+from scanchain.data import AnyPoints, Points, Pose
 from scanchain.errors import ScanchainError
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
@@ -24,16 +20,15 @@ from scanchain.runs.job import Job, Progress
 from scanchain.runs.results import cloud_of, expected_of
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
-from scanchain.runs.step_table import StepTable
+from scanchain.runs.step_table import steps_table
 from scanchain.settings import load_settings, overrides_of
-from scanchain.verdict import Judged, judge
+from scanchain.slam import SlamResult
+from scanchain.verdict import Judged
+from scanchain.verdict import judge as judge_evidence
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from scanchain.comparison.compare import Compared
     from scanchain.graph.optimization import Optimization
-    from scanchain.preprocess import Prepared
     from scanchain.sessions.changes import Changes
     from scanchain.sessions.localize import LocalizedLog
     from scanchain.sessions.merging import Merged
@@ -55,59 +50,17 @@ def _freeing() -> Iterator[None]:
         raise
 
 
-@dataclass(frozen=True, slots=True)
-class SlamResult(core.SlamResult):
-    """SLAM result of a log, with the map and the verdict of a run.
-
-    trajectory, odometry : T_world_lidar of every scan, after and before optimization
-    keyframes : the scans that are nodes of the graph; T_world_keyframes (K, d+1, d+1) are their final poses
-    closures : every loop closure tried
-    graph, state : the pose graph, and its state after the last optimization
-    components : (K,) label of each keyframe's submap; no loop joins different submaps; usually there is one
-    elevation_offset_rad, calibrated_from : correction of vertical angles, and the first scan with it; usually 0
-    map_errors : of the keyframes' poses, relative to the map that they were aligned to
-    config, steps : the configuration used, and the table that a run writes as steps.parquet
-    """
-
-    __repr__ = brief
-    config: Config = field(kw_only=True)
-    steps: pa.Table = field(kw_only=True)
-
-    def cloud(self) -> Points:
-        """(M, d) points of the map, moving objects removed, as in the map.ply of a run."""
-        return cloud_of(self.keyframes, self.T_world_keyframes, self.config).points
-
-    def verdict(self) -> Judged:
-        """The verdict on the trajectory, with reasons and segments, by the same checks as for a run."""
-        final, expected = final_verdicts(self.closures, self.state), expected_of(self, self.config)
-        table = closures_table(final, self.keyframes, self.trajectory.dimension)
-        return judge(evidence_of(self.steps, table, expected and expected.ate))
+def cloud(result: SlamResult) -> Points:
+    """(M, d) points of the map of a SLAM result, moving objects removed, as in the map.ply of a run."""
+    return cloud_of(result.keyframes, result.T_world_keyframes, result.config).points
 
 
-class Slam(core.Slam):
-    """Odometry, loop closing and pose graph: a step for every scan, the result at the end."""
-
-    def process(self, scan: Scan | Prepared) -> Step:
-        """Locate one scan and close loops; raises InputError as ``Odometry.process``, and after ``finish``."""
-        step = super().process(scan)
-        self.steps.append(step)
-        return step
-
-    @cached_property
-    def steps(self) -> StepTable:
-        """Figures of the scans so far, without their points."""
-        return StepTable()
-
-    def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
-        """Close the remaining loops, optimize once more, correct all scans accordingly and refine their poses.
-
-        progress : called with the name of each stage when it begins
-        Raises InputError if no scan was processed, and when called again.
-        """
-        result = super().finish(progress)
-        steps = self.steps.table(result.trajectory, self.T_base_lidar)
-        parts = {each.name: getattr(result, each.name) for each in fields(result)}
-        return SlamResult(**parts, config=self.config, steps=steps)
+def judge(result: SlamResult) -> Judged:
+    """The verdict on a SLAM result, with reasons and segments, by the same checks as for a run."""
+    final, expected = final_verdicts(result.closures, result.state), expected_of(result)
+    table = closures_table(final, result.keyframes, result.trajectory.dimension)
+    steps = steps_table(result.steps, result.trajectory, result.T_base_lidar)
+    return judge_evidence(evidence_of(steps, table, expected and expected.ate))
 
 
 @_freeing()

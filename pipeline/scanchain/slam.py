@@ -20,6 +20,7 @@ from scanchain.data import (
     Keyframe,
     KeyframeErrors,
     Matrix,
+    Points,
     Pose,
     Scan,
     Step,
@@ -29,14 +30,15 @@ from scanchain.data import (
 )
 from scanchain.errors import InputError, counted
 from scanchain.graph.factors import Odometry
+from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops import ClosureTable, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, Located, checked_start
-from scanchain.point_store import PointStore
+from scanchain.point_store import PointStore, StoredPoints
 from scanchain.preprocess import Prepared
 from scanchain.range_noise import RangeNoise
-from scanchain.trail import Trail
+from scanchain.steps import Steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class SlamResult:
     ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
     suffice or there is none.
     ``map_alike_share`` is the share of the searches of the map that found several similar locations.
-    ``noise`` is that of the ranges, measured on the first scans.
+    ``noise`` is that of the ranges, measured on the first scans; ``steps`` has the figures of all scans.
     ``components`` (K,) labels each keyframe's submap; no loop joins different submaps; usually there is one.
     """
 
@@ -68,6 +70,8 @@ class SlamResult:
     state: GraphState
     components: NDArray[np.int64]
     map_errors: Sequence[KeyframeErrors]
+    config: Config
+    steps: Steps
     warnings: tuple[str, ...] = ()
     mounting_note: str = ""
     T_base_lidar: Pose | None = None
@@ -120,10 +124,13 @@ class Slam:
         self.back_end = BackEnd(
             config, self.dimension, prior=prior, prior_is_final=prior_is_final, is_live=is_live
         )
-        self.trail = Trail(self.dimension, points_file, self.back_end.start_m, keeps_scans=self._refines)
+        self.steps = Steps()
+        self.points = PointStore(self.dimension, points_file)
+        self.spans = GrowingArray((2,), np.int64)  # rows of the points of each scan, if all are kept
+        self.traveled_m = self.back_end.start_m
 
     def __repr__(self) -> str:
-        scans = counted(len(self.trail), f"{self.dimension}D scan")
+        scans = counted(len(self.steps), f"{self.dimension}D scan")
         tried = counted(len(self.closures), "closure")
         return f"{type(self).__name__}({scans}, {counted(len(self.keyframes), 'keyframe')}, {tried} tried)"
 
@@ -136,11 +143,6 @@ class Slam:
     def keyframes(self) -> list[Keyframe]:
         """All so far, those of a prior map first."""
         return self.back_end.keyframes
-
-    @property
-    def points(self) -> PointStore:
-        """Points of the keyframes, and in the plane of all scans that are refined at the end."""
-        return self.trail.points
 
     @property
     def closures(self) -> ClosureTable:
@@ -161,7 +163,7 @@ class Slam:
         is_keyframe = self._add(located)
         closures, state = self.back_end.advance(is_keyframe=is_keyframe)
         seconds = (tracked.preprocess_s, tracked.match_s, tracked.map_s)
-        return Step(
+        step = Step(
             scan=tracked.scan,
             points=tracked.matched,
             T_odom_lidar=tracked.T_odom_lidar.copy(),  # the original is that of the keyframe
@@ -176,6 +178,8 @@ class Slam:
             timing=Timing(tracked.scan.waited_s, *seconds, working_s() - started),
             starts_segment=tracked.elsewhere_m > 0.0,
         )
+        self.steps.append(step)
+        return step
 
     def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
         """Close the remaining loops, optimize once more, correct all scans accordingly and refine their poses.
@@ -184,10 +188,10 @@ class Slam:
         Raises InputError if no scan was processed, and when called again.
         """
         self._check_unfinished()
-        if not len(self.trail):
+        if not len(self.steps):
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         self.is_finished = True
-        back_end, odometry = self.back_end, self.trail.odometry
+        back_end, odometry = self.back_end, self.steps.trajectory("T_odom_lidar")
         state, first = back_end.finish(progress), back_end.first
         scan_of = np.array([keyframe.scan_index for keyframe in self.keyframes[first:]])
         starts = [start - first for start in back_end.closer.segments.starts]
@@ -196,7 +200,7 @@ class Slam:
             progress(f"refining {counted(len(odometry), 'scan')}")
             fixed, poses = self.keyframes[:first], corrected[scan_of]
             world = (fixed, state.poses[:first]) if fixed else (self.keyframes, poses)
-            corrected = refined(corrected, self.trail.points_of, *world, self.config)
+            corrected = refined(corrected, self._points_of, *world, self.config)
         tracking, placement = self.front_end.odometry, back_end.placement
         return SlamResult(
             trajectory=Trajectory(odometry.stamps_ns, corrected),
@@ -207,6 +211,8 @@ class Slam:
             state=state,
             components=back_end.closer.segments.components(back_end.graph),
             map_errors=tuple(back_end.errors),
+            config=self.config,
+            steps=self.steps,
             warnings=tracking.predictor.wheels.warnings(),
             mounting_note=tracking.predictor.wheels.mounting.finish(),
             T_base_lidar=self.T_base_lidar,
@@ -225,26 +231,40 @@ class Slam:
 
     def _add(self, located: Located) -> bool:
         """Add a scan; True if it is a keyframe, which the motion from the last one joins to the graph."""
-        if len(self.trail) == 1:  # only now is the motion known that distorted the first scan
-            stored = self.trail.replace_first(located.first_points)
-            self.back_end.replace_points(self.back_end.first, stored)
-        stored = self.trail.add(located)
-        if not located.is_keyframe or stored is None:
+        tracked, number, back_end = located.tracked, len(self.steps), self.back_end
+        if number:
+            self.traveled_m += lie.apart(self.steps.columns["T_odom_lidar"][-1], tracked.T_odom_lidar)[0]
+        if number == 1:  # only now is the motion known that distorted the first scan
+            self.spans.replace(np.empty((0, 2)))
+            back_end.replace_points(back_end.first, self._stored(located.first_points))
+        if not located.is_keyframe and not self._refines:
             return False
-        tracked, number = located.tracked, len(self.keyframes)
+        stored = self._stored(tracked.points)
+        if not located.is_keyframe:
+            return False
         keyframe = Keyframe(
-            index=number,
-            scan_index=len(self.trail) - 1,
+            index=len(self.keyframes),
+            scan_index=number,
             stamp_ns=tracked.scan.stamp_ns,
             stored=stored,
             T_odom_lidar=tracked.T_odom_lidar,
-            traveled_m=self.trail.traveled_m,
+            traveled_m=self.traveled_m,
             scale=located.scale,
             noise_m=located.noise_m,
         )
         motion: list[Constraint] = []
-        if keyframe.scan_index:
+        if number:
             Z = lie.between(self.keyframes[-1].T_odom_lidar, keyframe.T_odom_lidar)
-            motion.append(Constraint(Odometry(), number - 1, Z, located.information))
-        self.back_end.add(keyframe, motion, located.errors, starts_segment=tracked.elsewhere_m > 0.0)
+            motion.append(Constraint(Odometry(), keyframe.index - 1, Z, located.information))
+        back_end.add(keyframe, motion, located.errors, starts_segment=tracked.elsewhere_m > 0.0)
         return True
+
+    def _stored(self, points: Points) -> StoredPoints:
+        """Points (M, d) of the newest scan, stored in the file."""
+        stored = self.points.add(points)
+        self.spans.append((stored.first, stored.count))
+        return stored
+
+    def _points_of(self, scan: int) -> Points:
+        """(M, d) points of a scan, if all scans are kept."""
+        return StoredPoints(self.points, *self.spans.rows[scan].tolist()).read()

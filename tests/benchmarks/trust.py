@@ -120,7 +120,7 @@ def placed(
     slam = Slam(config, log.T_base_lidar)
     steps = [slam.process(scan) for scan in log.scans()]
     result = slam.finish()
-    expected = expected_of(result, config, open_log([path], log.config).scans(), log.distorted_share)
+    expected = expected_of(result, open_log([path], log.config).scans(), log.distorted_share)
     return result, steps, log.T_base_lidar, expected, log.ground_truth()
 
 
@@ -226,7 +226,7 @@ def relations_line(name: str) -> Line:
     config = load_settings(2).config
     opened = open_log([log])
     choose_point_times(opened)
-    systematic = systematic_of(result, config, opened.scans(), opened.distorted_share)
+    systematic = systematic_of(result, opened.scans(), opened.distorted_share)
     samples = error_samples(result.graph, result.map_errors, config, *systematic)
     expected_m = np.concatenate([_relation_errors(each, poses, a[chosen], b[chosen]) for each in samples])
     expected_m = np.sqrt(expected_m**2 + noise[0, 0] + noise[1, 1])

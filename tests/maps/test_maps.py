@@ -16,7 +16,6 @@ from scanchain.logs import open_log
 from scanchain.logs.formats.clouds import read_pcd
 from scanchain.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS, OCCUPIED_PROBABILITY
 from scanchain.runs.results import results_of
-from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam
 from tests.support import made
 from tests.support import naive_maps as naive
@@ -230,7 +229,7 @@ def test_the_grid_is_level_however_the_lidar_is_mounted(tilt_deg):
     log, slam = open_log(path), Slam(dimension=3)
     for scan in log.scans():
         slam.process(replace(scan, points=lie.transform(T_lidar_level, scan.points).astype(np.float32)))
-    found = results_of(log, slam.config, StepTable(), slam.finish(), ())
+    found = results_of(log, slam.finish(), ())
     tilt_rad = math.acos(min(found.T_world_level[2, 2], 1.0))
     assert math.degrees(tilt_rad) == pytest.approx(tilt_deg, abs=2.0)
     assert [f"tilted by {tilt_deg:.0f} deg" in warning for warning in found.warnings] == [True] * (tilt_deg > 0.0)

@@ -26,7 +26,7 @@ def result_of(path, **of_log):
     for scan in log.scans():
         slam.process(scan)
     result = slam.finish()
-    quick, full = (expected_of(result, config, scans).ate for scans in (None, open_log([path], **of_log).scans()))
+    quick, full = (expected_of(result, scans).ate for scans in (None, open_log([path], **of_log).scans()))
     true_m = absolute_error(pair(result.trajectory, log.ground_truth())).translation_m.rmse
     return result, config, quick, full, true_m
 

@@ -11,7 +11,6 @@ from scanchain import lie
 from scanchain.logs import open_log
 from scanchain.runs.directory import POINTS_FILE
 from scanchain.runs.resume import Checkpoints, read_checkpoint
-from scanchain.runs.step_table import StepTable
 from scanchain.simulation.drive import plan, record
 from scanchain.slam import Slam
 from tests.support import made
@@ -120,7 +119,7 @@ def test_an_interrupted_estimate_goes_on_to_the_bit(tmp_path):
     for stop in (3, 40, 77):
         for scan in scans[slam.front_end.scans : stop]:
             np.testing.assert_array_equal(slam.process(scan).T_odom_lidar, poses[scan.index])
-        Checkpoints(tmp_path, 10.0).write(slam, StepTable())
+        Checkpoints(tmp_path, 10.0).write(slam)
         slam.points.close()
         slam = read_checkpoint(tmp_path, config).slam
         slam.points.reopen(tmp_path / POINTS_FILE)

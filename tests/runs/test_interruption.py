@@ -21,7 +21,6 @@ from scanchain.logs import open_log
 from scanchain.runs import resume
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume import Checkpoints, read_checkpoint
-from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
 from scanchain_viz.recording import entities
@@ -88,7 +87,7 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
         killing.wait_for_steps(child, out, share * len(stamps_ns))
         child.send_signal(interruption)
         child.wait()
-        table = read_checkpoint(killing.partial(out), killing.config_of(killing.partial(out))).steps
+        table = read_checkpoint(killing.partial(out), killing.config_of(killing.partial(out))).slam.steps
         reached.append(len(table))
         assert (killing.partial(out) / RECORDING_FILE).exists()
         np.testing.assert_array_equal(table.trajectory("T_odom_lidar").stamps_ns, stamps_ns[: len(table)])
@@ -194,15 +193,15 @@ def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monke
 # dawdles before scan 100, then says "there" and waits
 WAITING = """
 from scanchain.slam import Slam
-place = Slam.place
-def waiting(self, located):
-    if located.tracked.scan.index == 99:
+process = Slam.process
+def waiting(self, scan):
+    if scan.index == 99:
         time.sleep(0.2)
-    if located.tracked.scan.index == 100:
+    if scan.index == 100:
         print("there", flush=True)
         time.sleep(60)
-    return place(self, located)
-Slam.place = waiting
+    return process(self, scan)
+Slam.process = waiting
 """
 
 
@@ -357,11 +356,11 @@ def test_without_a_place_for_a_key_a_run_says_that_it_has_no_checkpoints(office,
 
 def test_a_state_that_cannot_be_pickled_leaves_the_checkpoint_before(tmp_path):
     slam = Slam(configured(2), dimension=2, points_file=tmp_path / POINTS_FILE)
-    Checkpoints(tmp_path, 10.0).write(slam, StepTable())
+    Checkpoints(tmp_path, 10.0).write(slam)
     slam.harm = lambda: None
     before = (tmp_path / "state.checkpoint").read_bytes()
     with pytest.raises((AttributeError, pickle.PicklingError)):
-        Checkpoints(tmp_path, 10.0).write(slam, StepTable())
+        Checkpoints(tmp_path, 10.0).write(slam)
     assert (tmp_path / "state.checkpoint").read_bytes() == before
     assert not list(tmp_path.glob("*.new"))
 
@@ -374,10 +373,10 @@ def test_a_checkpoint_that_names_code_or_another_configuration_is_not_resumed(of
     slam = Slam(config, open_log(office).T_base_lidar, tmp_path / POINTS_FILE)
     for changed in ("evil_matcher:Cls", "svd"):
         slam.config = slam.front_end.odometry.config = configured(2, {"matching.matcher": changed})
-        Checkpoints(tmp_path, 10.0).write(slam, StepTable())
+        Checkpoints(tmp_path, 10.0).write(slam)
         with pytest.raises(InputError, match="has another config"):
             read_checkpoint(tmp_path, config)
     assert not (tmp_path / "executed").exists()
     slam.config = slam.front_end.odometry.config = config
-    Checkpoints(tmp_path, 10.0).write(slam, StepTable())
+    Checkpoints(tmp_path, 10.0).write(slam)
     assert read_checkpoint(tmp_path, config).slam.config == config

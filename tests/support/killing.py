@@ -21,7 +21,6 @@ from scanchain.graph.g2o import read_g2o
 from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume import Checkpoints, read_checkpoint
-from scanchain.runs.step_table import StepTable
 from scanchain.settings import load_settings
 from scanchain.trajectory import read_kitti, read_tum
 from scanchain_viz.recording import entities
@@ -73,7 +72,7 @@ def steps_on_disk(out):
     """Scans of the last checkpoint."""
     folder = partial(out) or out
     try:
-        return len(read_checkpoint(folder, config_of(folder)).steps)
+        return len(read_checkpoint(folder, config_of(folder)).slam.steps)
     except (FileNotFoundError, InputError):  # not there yet, or just taking another name
         return 0
 
@@ -175,7 +174,7 @@ def _left(out, after_s):
 
 def taken_up(slam, folder):
     """A chain, its points in a folder, that was put down there and is taken up again."""
-    Checkpoints(folder, 10.0).write(slam, StepTable())
+    Checkpoints(folder, 10.0).write(slam)
     again = read_checkpoint(folder, slam.config).slam
     again.points.reopen(folder / POINTS_FILE)
     return again
@@ -198,7 +197,7 @@ def _read_as_viewer(path):
 
 
 _READ = {
-    CHECKPOINT_FILE: lambda path: len(read_checkpoint(path.parent, config_of(path.parent)).steps),
+    CHECKPOINT_FILE: lambda path: len(read_checkpoint(path.parent, config_of(path.parent)).slam.steps),
     MAP_FOLDER: open_saved_map,
     POINTS_FILE: lambda path: np.fromfile(path, np.float32),
     "keyframes.tum": lambda path: _check(np.loadtxt(path, ndmin=2).shape[1] == 8 + 21),  # covariance's triangle

@@ -11,7 +11,8 @@ from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.errors import at_most
 from scanchain.runs.evidence import evidence_of, evidence_of_trajectory
-from scanchain.runs.step_table import StepTable, write_table
+from scanchain.runs.step_table import steps_table, write_table
+from scanchain.steps import Steps
 from scanchain.verdict import Closures, Evidence, Kind, Stretch, Verdict, apart_m, judge
 from scanchain.verdict.scans import check_overlap, check_velocity
 from scanchain.verdict.wheels import wheel_bound_m
@@ -443,7 +444,7 @@ def test_revisited_places_that_do_not_look_as_mapped_are_to_be_checked(tried, ve
 
 
 def test_a_table_holds_the_figures_of_the_steps(tmp_path):
-    table = StepTable()
+    table = Steps()
     steps = [
         replace(step, reason=f"a new map begins {step.scan.index % 3}", starts_segment=step.scan.index == 7)
         for step in drive(20, 2)
@@ -457,7 +458,7 @@ def test_a_table_holds_the_figures_of_the_steps(tmp_path):
     np.testing.assert_array_equal(columns["T_odom_base"][9], T_odom_base)
     np.testing.assert_array_equal(columns["information"], [step.match.information for step in steps])
     np.testing.assert_array_equal(columns["timing"][:, 2], [step.timing.match_s for step in steps])
-    write_table(tmp_path / "steps.parquet", table.table(table.trajectory("T_world_lidar")))
+    write_table(tmp_path / "steps.parquet", steps_table(table, table.trajectory("T_world_lidar")))
     written = pq.ParquetFile(tmp_path / "steps.parquet").read()
     assert written["reason"].to_pylist() == [step.reason for step in steps]
     found = evidence_of(written, None)

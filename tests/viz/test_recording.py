@@ -19,7 +19,7 @@ from scanchain.config import RecordingConfig
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.closures import final_verdicts
-from scanchain.runs.step_table import StepTable
+from scanchain.steps import Steps
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.recording import drawing, entities, sinks, viewer
 from scanchain_viz.recording.drawing import Message
@@ -305,7 +305,7 @@ def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):
 
 
 def table_of(steps):
-    table = StepTable()
+    table = Steps()
     for step in steps:
         table.append(step)
     return table

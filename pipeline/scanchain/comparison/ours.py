@@ -14,7 +14,7 @@ from scanchain.data import Pose, Scan, Trajectory
 from scanchain.runs.closures import closures_table, final_verdicts
 from scanchain.runs.directory import METRICS_FILE
 from scanchain.runs.results import expected_of
-from scanchain.runs.step_table import StepTable, write_table
+from scanchain.runs.step_table import steps_table, write_table
 from scanchain.slam import Slam
 
 
@@ -27,19 +27,16 @@ class Ours:
         closing = "; loops closed, pose graph optimized at the end" if self.has_loops else ""
         self.description = f"{_description(config)}{closing}"
         self.slam = Slam(config, T_base_lidar if is_mounted else None, dimension=len(T_base_lidar) - 1)
-        self.steps = StepTable()
 
     def track(self, scan: Scan) -> Pose:
         """T_odom_lidar (d+1, d+1)."""
-        step = self.slam.process(scan)
-        self.steps.append(step)
-        return step.T_odom_lidar
+        return self.slam.process(scan).T_odom_lidar
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
         """The final poses; tables go into the folder."""
         self.result = result = self.slam.finish()
         trajectory = result.trajectory if self.has_loops else odometry
-        write_table(folder / STEPS_FILE, self.steps.table(trajectory, result.T_base_lidar))
+        write_table(folder / STEPS_FILE, steps_table(result.steps, trajectory, result.T_base_lidar))
         if self.has_loops:
             final = final_verdicts(result.closures, result.state)
             write_table(folder / CLOSURES_FILE, closures_table(final, result.keyframes, odometry.dimension))
@@ -48,7 +45,7 @@ class Ours:
     def measure_errors(self, scans: StoredScans, folder: Path) -> None:
         """Write the expected ATE, by processing all scans once more, into the folder."""
         again = scans.scans() if self.config.outputs.error_bars == "full" else None
-        expected = expected_of(self.result, self.config, again, scans.distorted_share)
+        expected = expected_of(self.result, again, scans.distorted_share)
         (folder / METRICS_FILE).write_bytes(msgspec.json.encode({"expected_ate_m": expected and expected.ate}))
 
 

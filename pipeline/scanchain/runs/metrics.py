@@ -14,8 +14,8 @@ from scanchain.errors import InputError, counted, folded
 from scanchain.evaluation import ExpectedError, Pairs, absolute_error_of_any_path, kitti_error_of_any_path, pair
 from scanchain.evaluation.errors import far_off, path_length
 from scanchain.runs.results import Results
-from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult
+from scanchain.steps import STAGES
 from scanchain.verdict import Judged, Stretch, Verdict
 
 VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and indent of the reasons below it
@@ -153,7 +153,6 @@ class Metrics(Struct, frozen=True):
 
 
 def measure(
-    steps: StepTable,
     results: Results,
     expected: ExpectedError | None,
     judged: Judged,
@@ -165,7 +164,7 @@ def measure(
     stopped: str = "",
 ) -> Metrics:
     """Metrics of a finished run."""
-    result, cloud, final = results.result, results.cloud, results.final
+    result, cloud, final, steps = results.result, results.cloud, results.final, results.result.steps
     columns, states = steps.columns, steps.states()
     residuals_m = columns["residual_m"][np.isfinite(columns["residual_m"])]
     stage_s = columns["timing"]
@@ -199,7 +198,7 @@ def measure(
         degrees_of_freedom=result.state.degrees_of_freedom,
         median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
         p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
-        median_inlier_share=float(np.median(inlier_shares(columns))),
+        median_inlier_share=float(np.median(steps.inlier_shares)),
         median_residual_m=float(np.median(residuals_m)) if len(residuals_m) else None,
         median_iterations=float(np.median(columns["iterations"])),
         ground_truth=ground_truth,

@@ -45,7 +45,7 @@ from scanchain.runs.closures import closures_table
 from scanchain.runs.evidence import evidence_of
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
-from scanchain.runs.step_table import StepTable, write_table
+from scanchain.runs.step_table import steps_table, write_table
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum
 from scanchain.verdict import Judged, judge
@@ -76,8 +76,6 @@ class Results:
     """
 
     log: Log
-    config: Config
-    steps: StepTable
     result: SlamResult
     final: tuple[Closure, ...]
     drawn: Future[Cloud]
@@ -87,7 +85,7 @@ class Results:
     @cached_property
     def steps_table(self) -> pa.Table:
         """The table of the scans."""
-        return self.steps.table(self.result.trajectory, self.result.T_base_lidar)
+        return steps_table(self.result.steps, self.result.trajectory, self.result.T_base_lidar)
 
     @cached_property
     def closures_table(self) -> pa.Table:
@@ -128,26 +126,24 @@ def _write_saved_map(path: Path, results: Results) -> None:
     session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)
     write_saved_map(SavedMap(path, graph.dimension, keyframes, numbers, (session,), in_force))
-    if results.config.loops.enabled and graph.dimension == 3:
-        outline_of(path, open_saved_map(path).keyframes, results.config.local_map)
+    if result.config.loops.enabled and graph.dimension == 3:
+        outline_of(path, open_saved_map(path).keyframes, result.config.local_map)
 
 
-def results_of(
-    log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[Closure, ...]
-) -> Results:
+def results_of(log: Log, result: SlamResult, final: tuple[Closure, ...]) -> Results:
     """The results of a log with the maps made from its keyframes."""
-    beside = ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
+    config, beside = result.config, ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
     drawn = beside.submit(cloud_of, result.keyframes, result.T_world_keyframes, config)
     beside.shutdown(wait=False)
     T_world_level = lie.identity(log.dimension)
     if log.dimension == 3:
         T_world_level = level_of(result.keyframes, result.T_world_keyframes, config.local_map)
     grid = grid_of(result.keyframes, lie.inverse(T_world_level) @ result.T_world_keyframes, config.maps)
-    return Results(log, config, steps, result, final, drawn, grid, T_world_level)
+    return Results(log, result, final, drawn, grid, T_world_level)
 
 
 def expected_of(
-    result: SlamResult, config: Config, scans: Iterable[Scan] | None = None, distorted_share: float = 0.0
+    result: SlamResult, scans: Iterable[Scan] | None = None, distorted_share: float = 0.0
 ) -> ExpectedErrors | None:
     """Expected errors of scans and keyframes; None without edges, or where these do not constrain all poses.
 
@@ -156,9 +152,9 @@ def expected_of(
     """
     if not len(result.graph.edges):
         return None
-    systematic = systematic_of(result, config, scans, distorted_share)
+    systematic = systematic_of(result, scans, distorted_share)
     try:
-        expected = expected_errors(result.graph, result.map_errors, config, *systematic)
+        expected = expected_errors(result.graph, result.map_errors, result.config, *systematic)
     except InputError:  # poses that no edge constrains
         return None
     where = _most_uncertain(result.keyframe_trajectory, expected.covariances)
@@ -166,7 +162,7 @@ def expected_of(
 
 
 def systematic_of(
-    result: SlamResult, config: Config, scans: Iterable[Scan] | None, distorted_share: float
+    result: SlamResult, scans: Iterable[Scan] | None, distorted_share: float
 ) -> tuple[ScanPoses, Influence | None]:
     """Poses of scans, with their possible distortion, and the influence of groups of beam directions on them.
 
@@ -179,7 +175,7 @@ def systematic_of(
     found, open_motions = None, np.zeros((len(chosen), result.graph.freedom))
     if scans is not None:
         mounting, offset_rad = result.T_base_lidar, result.elevation_offset_rad
-        found = influence(scans, odometry, keyframes, chosen, config, mounting, offset_rad)
+        found = influence(scans, odometry, keyframes, chosen, result.config, mounting, offset_rad)
         after = np.minimum(chosen, len(odometry) - 2) + 1
         open_motions = distorted_share * lie.log(lie.between(odometry[after - 1], odometry[after]))
     poses = result.trajectory.poses[chosen]
@@ -201,7 +197,7 @@ def _most_uncertain(keyframes: Trajectory, covariances: Matrix) -> str:
 
 def write_results(folder: Path, results: Results) -> None:
     """Write every requested output into a run directory; a new format needs a writer and a line here."""
-    log, config, result = results.log, results.config, results.result
+    log, result, config = results.log, results.result, results.result.config
     trajectory, graph = result.trajectory, result.graph
     write_tum(folder / "trajectory.tum", trajectory)
     write_kitti(folder / "trajectory.kitti.txt", trajectory)
@@ -224,7 +220,7 @@ def write_results(folder: Path, results: Results) -> None:
     if config.maps.write_laz:
         write_laz(folder / "map.laz", points)
     if config.outputs.mcap:  # after the maps, which it reads
-        write_results_mcap(folder / "results.mcap", log, results.steps, result, results.T_world_level)
+        write_results_mcap(folder / "results.mcap", log, result, results.T_world_level)
 
 
 def record_results(recording: Recorder, results: Results) -> None:

@@ -22,14 +22,14 @@ from scanchain.logs.writer import (
     place,
 )
 from scanchain.maps import read_map, read_ply
-from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult
+from scanchain.steps import Steps
 
 _WORLD, _ODOM = "world", "odom"
 _PLANAR = [0, 1, 5]  # x, y, yaw among x, y, z, roll, pitch, yaw
 
 
-def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResult, T_world_grid: Pose) -> None:
+def write_results_mcap(path: Path, log: Log, result: SlamResult, T_world_grid: Pose) -> None:
     """Write /tf and /odometry per scan, and /path, /map and /map_cloud at the log time of the first scan.
 
     world → odom is the correction by loop closures, odom → robot the odometry; the robot's frame is the root of
@@ -37,6 +37,7 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
     same folder; ``T_world_grid`` is the pose of the grid's frame.
     """
     moving = moving_frame(log.indexes, log.publishers.frame, log.mounting, dimension=log.dimension)
+    steps = result.steps
     first_ns, first_log_ns = (int(steps.columns[name][0]) for name in ("stamp_ns", "log_time_ns"))
     with LogWriter(path) as writer:
         trajectory = result.trajectory
@@ -67,7 +68,7 @@ def ros_covariance(covariance: Matrix, T: Pose) -> NDArray[np.float64]:
     return turn @ spread @ turn.T
 
 
-def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, poses: Matrix) -> None:
+def _write_motion(writer: LogWriter, moving: MovingFrame, steps: Steps, poses: Matrix) -> None:
     T_lidar_frame = moving.T_lidar_frame
     adjoint = lie.adjoint(lie.inverse(T_lidar_frame))
     stamps_ns, log_times_ns = (steps.columns[name].tolist() for name in ("stamp_ns", "log_time_ns"))

@@ -39,9 +39,10 @@ from scanchain.runs.directory import (
 from scanchain.runs.job import Recorder
 from scanchain.runs.opening import Opened
 from scanchain.runs.provenance import package_version
-from scanchain.runs.step_table import StepTable, write_table
+from scanchain.runs.step_table import steps_table, write_table
 from scanchain.settings import flatten
 from scanchain.slam import Slam
+from scanchain.steps import Steps
 from scanchain.trajectory import write_tum
 
 _LEISURE = 20.0  # minimum ratio of the time between two checkpoints to the time to write one
@@ -63,7 +64,6 @@ class Checkpoint:
     process: int
     recorded_bytes: int
     slam: Slam
-    steps: StepTable
 
 
 class Checkpoints:
@@ -71,7 +71,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, every_s: float, left: Checkpoint | None = None) -> None:
         """``left`` is the checkpoint to resume from, whose time of work is added to that of this process."""
-        self.left, self.steps = left, StepTable() if left is None else left.steps
+        self.left = left
         self.path = folder / CHECKPOINT_FILE
         self.version = _version()
         self.process = 0 if left is None else left.process + 1
@@ -105,11 +105,11 @@ class Checkpoints:
         if is_whole:
             os.truncate(before, left.recorded_bytes)
         recording.resume(
-            before if is_whole else None, left.steps, left.slam.closures, left.slam.back_end.graph.state()
+            before if is_whole else None, left.slam.steps, left.slam.closures, left.slam.back_end.graph.state()
         )
         recorded_bytes = recording.secure()
-        self.write(left.slam, left.steps, recorded_bytes)
-        note = f"resumed after {counted(len(left.steps), 'scan')}"
+        self.write(left.slam, recorded_bytes)
+        note = f"resumed after {counted(len(left.slam.steps), 'scan')}"
         if recorded_bytes and is_whole:
             before.unlink()
         elif before.exists():
@@ -122,7 +122,7 @@ class Checkpoints:
         """True when it is time for the next checkpoint."""
         return bool(self.key) and perf_counter() >= self.next_s
 
-    def write(self, slam: Slam, steps: StepTable, recorded_bytes: int = 0) -> None:
+    def write(self, slam: Slam, recorded_bytes: int = 0) -> None:
         """Write a checkpoint atomically: a line with the version, a pickle, and the signature of both.
 
         Raises OSError on a full disk; the last checkpoint stays. Nothing is written if there is no key.
@@ -133,7 +133,7 @@ class Checkpoints:
         slam.points.flush()
         file = io.BytesIO(self.version)
         file.seek(0, os.SEEK_END)
-        _Pickler(file, slam.config).dump((working_s() - self.began_s, self.process, recorded_bytes, slam, steps))
+        _Pickler(file, slam.config).dump((working_s() - self.began_s, self.process, recorded_bytes, slam))
         file.write(hmac.digest(self.key, file.getvalue(), "sha256"))
         write_whole(self.path, file.getvalue())
         now = perf_counter()
@@ -243,7 +243,7 @@ class _Unpickler(pickle.Unpickler):
 def _after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Scan, None, None]:
     """The scans after those already processed. Raises InputError if the processed ones differ from the log."""
     names = ("index", "stamp_ns", "log_time_ns", "scan_points", "dropped")
-    for index, *known in zip(*(left.steps.columns[name].tolist() for name in names), strict=True):
+    for index, *known in zip(*(left.slam.steps.columns[name].tolist() for name in names), strict=True):
         scan = next(scans, None)
         if scan is None or [scan.stamp_ns, scan.log_time_ns, len(scan.points), scan.dropped] != known:
             raise InputError(f"{left.folder}: scan {index} of the log is not the one that was run; {_REMEDY}")
@@ -277,7 +277,7 @@ def how_to_resume(command: Sequence[str]) -> str:
     return f"to resume: {again}"
 
 
-def rescued(error: BaseException, directory: RunDirectory, steps: StepTable) -> BaseException:
+def rescued(error: BaseException, directory: RunDirectory, steps: Steps) -> BaseException:
     """The error to raise; the results so far are written, and the error names their directory."""
     is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
     directory.worth_keeping()
@@ -302,7 +302,7 @@ def rescued(error: BaseException, directory: RunDirectory, steps: StepTable) -> 
     return ScanchainError(f"{kind}{reason}; {where}")
 
 
-def _keep(bug: BaseException | None, folder: Path, steps: StepTable) -> None:
+def _keep(bug: BaseException | None, folder: Path, steps: Steps) -> None:
     """Write the results so far. Raises OSError on a full disk, after which nothing half-written is left."""
     odometry, table, trace = (folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt"))
     try:
@@ -310,7 +310,7 @@ def _keep(bug: BaseException | None, folder: Path, steps: StepTable) -> None:
             trace.write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
         if len(steps) and not (folder / "metrics.json").exists():  # else the final results are already written
             write_tum(odometry, steps.trajectory("T_odom_lidar"), force=True)
-            write_table(table, steps.table(steps.trajectory("T_world_lidar")))
+            write_table(table, steps_table(steps, steps.trajectory("T_world_lidar")))
     except OSError:
         for path in (odometry, table, trace):
             path.unlink(missing_ok=True)

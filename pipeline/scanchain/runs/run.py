@@ -23,6 +23,7 @@ from scanchain.runs.opening import Opened, opened
 from scanchain.runs.results import Results, expected_of, record_results, results_of, write_results
 from scanchain.runs.resume import Checkpoints, read_checkpoint, rescued
 from scanchain.slam import Slam, SlamResult
+from scanchain.steps import Steps
 from scanchain.threads import threads
 from scanchain.trajectory import write_wide_tum
 from scanchain.verdict import Judged
@@ -101,7 +102,9 @@ class _Run:
     ) -> None:
         self.source, self.log, self.config = source, source.log, source.config
         self.directory, self.checkpoints, self.progress = directory, checkpoints, progress
-        self.steps, self.notes, self.resumed = checkpoints.steps, list[str](), ""
+        left = checkpoints.left
+        self.steps = Steps() if left is None else left.slam.steps
+        self.notes, self.resumed = list[str](), ""
 
     def announce(self, *, is_resumed: bool) -> None:
         """Show what is processed, and whether from the first scan on."""
@@ -132,18 +135,17 @@ class _Run:
         checkpoints = self.checkpoints
         if recording.web_address:
             self.progress.announce(f"viewer: {recording.web_address}")
-        self.resumed = checkpoints.resume(recording)
+        self.steps, self.resumed = slam.steps, checkpoints.resume(recording)
         with closing(scans):  # counts what the log left out, also if the run was stopped
             tracked = self.progress.track(scans, self.log.scan_count)
             if slam.dimension == 3 and threads() > 1:
                 tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
             for scan in tracked:
                 step = slam.process(scan)
-                self.steps.append(step)
                 recording.log(step)
                 if checkpoints.are_due():
-                    checkpoints.write(slam, self.steps, recording.secure())
-        checkpoints.write(slam, self.steps, recording.secure())  # an interruption from here on loses no scan
+                    checkpoints.write(slam, recording.secure())
+        checkpoints.write(slam, recording.secure())  # an interruption from here on loses no scan
         return slam.finish(self.progress.say)
 
     def write(self, result: SlamResult, recording: Recorder) -> tuple[Results, ExpectedErrors | None, Judged]:
@@ -151,7 +153,7 @@ class _Run:
         self.progress.say("building the maps and writing the results")
         with self.directory.results() as folder:
             final = final_verdicts(result.closures, result.state)
-            results = results_of(self.log, self.config, self.steps, result, final)
+            results = results_of(self.log, result, final)
             write_results(folder, results)
             expected = self.expected(result)
             if expected is not None:
@@ -174,10 +176,10 @@ class _Run:
             )
             try:
                 with closing(self.source.scans_again()) as scans:
-                    return expected_of(result, self.config, scans, self.log.distorted_share)
+                    return expected_of(result, scans, self.log.distorted_share)
             except (InputError, OSError) as error:
                 self.notes.append(f"error bars of random errors only: {error}")
-        return expected_of(result, self.config)
+        return expected_of(result)
 
     def hold(self, recording: Recorder, *, is_saved: bool) -> float:
         """Keep the web viewer, which ends with the recording, open until the user stops it; seconds waited."""
@@ -204,7 +206,7 @@ class _Run:
         with self.directory.results() as folder:
             truth, note = self.source.accuracy(result, folder)
             metrics = measure(
-                self.steps, results, expected and expected.ate, judged, **times_s, ground_truth=truth,
+                results, expected and expected.ate, judged, **times_s, ground_truth=truth,
                 warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
             notes = [note for note in (self.resumed, *log.notes, result.mounting_note, *idle) if note]

@@ -151,7 +151,7 @@ class Localizer:
         self.states.append(placed.state)
         self.live.append(np.full(step.T_odom_lidar.shape, np.nan) if T is None else T)
         self.sigma_m.append(math.sqrt(sum(variances)))
-        self.traveled_m.append(self.slam.trail.traveled_m - self.start_m)
+        self.traveled_m.append(self.slam.traveled_m - self.start_m)
         return placed
 
     def finish(self) -> Localization:

@@ -17,7 +17,8 @@ from scanchain.comparison.table import Row, read_table
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error_of_any_path, pair, path_length
 from scanchain.runs.evidence import poses_of
-from scanchain.runs.step_table import STAGES, nees_of_steps
+from scanchain.runs.step_table import nees_of_steps
+from scanchain.steps import STAGES
 from scanchain_viz.colors import ODOMETRY, OPTIMIZED, color_of
 from scanchain_viz.pictures.figure import Floats, around
 

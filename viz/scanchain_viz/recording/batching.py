@@ -14,7 +14,7 @@ from scanchain import lie
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, ClosureVerdict, GraphState, Matrix, State, Step
 from scanchain.runs.closures import final_verdicts
-from scanchain.runs.step_table import STAGES, StepTable
+from scanchain.steps import STAGES, Steps
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
 
@@ -121,7 +121,7 @@ class Batcher:
         self.last: Matrix | None = None  # (1, d+1, d+1) T_odom_lidar of the previous scan
         self.state: State | None = None
 
-    def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> None:
+    def restore(self, steps: Steps, closures: Sequence[Closure], graph: GraphState) -> None:
         """Restore the state after these steps from the closures and the graph at that time."""
         odom, world = steps.columns["T_odom_lidar"], steps.columns["T_world_lidar"]
         positions = drawing.positions(world)

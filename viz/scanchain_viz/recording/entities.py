@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from scanchain.data import State
-from scanchain.runs.step_table import STAGES
+from scanchain.steps import STAGES
 from scanchain.verdict import Kind
 from scanchain_viz.colors import STRETCH_COLORS, between, height_shares, rgb
 from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels

@@ -22,7 +22,7 @@ from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.job import SinkName
-from scanchain.runs.step_table import StepTable
+from scanchain.steps import Steps
 from scanchain.verdict import Judged, Kind
 from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
@@ -89,9 +89,7 @@ class Recording:
         """Problems so far, one line each."""
         return [*self.problems, *(warning for sink in self.opened for warning in sink.warnings)]
 
-    def resume(
-        self, before: Path | None, steps: StepTable, closures: Sequence[Closure], graph: GraphState
-    ) -> None:
+    def resume(self, before: Path | None, steps: Steps, closures: Sequence[Closure], graph: GraphState) -> None:
         """Resume after these steps, with all closures tried by then and the graph as it was.
 
         before : the recording up to there, which is copied; without one, the recording begins here

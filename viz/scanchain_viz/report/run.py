@@ -18,8 +18,8 @@ from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
 from scanchain.runs.metrics import REASON, VERDICT, GroundTruth, Metrics, accuracy_lines, lines_of
 from scanchain.runs.provenance import Provenance
-from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
+from scanchain.steps import STAGES
 from scanchain.trajectory import read_tum
 from scanchain.verdict import CHECKS, Kind, Stretch
 from scanchain_viz.colors import CLOSURES, OPTIMIZED, STRETCH_COLORS, TRUTH, color_of
