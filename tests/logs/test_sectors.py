@@ -52,7 +52,7 @@ def assert_same(scans, expected, *, within_s=2e-6):
     "how",
     [
         Cut(30.0), Cut(90.0), Cut(120.0), Cut(180.0), Cut(5.0),
-        Cut(30.0, unit="us"), Cut(5.0, unit="ms"), Cut(180.0, unit="s"),
+        Cut(30.0, unit="us"), Cut(90.0, unit="ms"), Cut(180.0, unit="s"),
     ],
     ids=str,
 )  # fmt: skip

@@ -53,7 +53,7 @@ def undisturbed(request, office, whole, tmp_path_factory):
     """A log and its run."""
     if request.param == "2D":
         return office, whole
-    log, out = made.log("town", seconds=18, sensor="vlp-16"), tmp_path_factory.mktemp("town") / "run"
+    log, out = made.log("town", seconds=10, sensor="vlp-16"), tmp_path_factory.mktemp("town") / "run"
     assert killing.start(log, out, *RECORDED).wait() == 0
     return log, out
 
