@@ -9,10 +9,10 @@ scanchain.simulate("office", "office.mcap", duration_s=8.0)
 log = scanchain.open_log("office.mcap")
 target, source = log[60].points, log[70].points
 
-T_target_source, tree = np.eye(3), KDTree(target)
+T_target_source, tree, iteration = np.eye(3), KDTree(target), 0
 for iteration in range(100):
     moved = source @ T_target_source[:2, :2].T + T_target_source[:2, 2]
-    distance_m, nearest = tree.query(moved)
+    distance_m, nearest = map(np.asarray, tree.query(moved))
     is_close = distance_m < 0.5
     change = scanchain.rigid_transform(moved[is_close], target[nearest[is_close]])
     T_target_source = change @ T_target_source

@@ -10,14 +10,14 @@ def driver():
         yield scan.points, scan.stamp_ns * 1e-9
 
 
-slam = scanchain.Slam(dimension=2, is_live=True)
+slam, poses = scanchain.Slam(dimension=2, is_live=True), []
 for points, stamp_s in driver():
     scan = scanchain.Scan.of(points, stamp_s)  # add T_odom_base=… for wheels, times_s=… for the time of each point
     step = slam.process(scan)
     if step.state != "ok":
         print(step.state, step.match.reason)
-    T_world_lidar = step.T_world_lidar  # (3, 3); after a loop closure it jumps, T_odom_lidar never does
-print(T_world_lidar[:2, 2].round(2))  # -> [ 4.36 -3.09]
+    poses.append(step.T_world_lidar)  # (3, 3); jumps at loop closures, step.T_odom_lidar never does
+print(len(poses), poses[-1][:2, 2].round(2))  # -> 100 [ 4.36 -3.09]
 
 result = slam.finish()  # closes the last loops and corrects every scan
 scanchain.write_tum("trajectory.tum", result.trajectory)

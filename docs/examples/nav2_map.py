@@ -18,6 +18,5 @@ free, occupied = (pixels == 254).sum(), (pixels == 0).sum()
 print(pixels.shape, free > 10 * occupied > 0)  # -> (362, 442) True
 
 localizer = scanchain.Localizer("runs/office", initial=np.eye(3))  # poses in the frame of the grid
-for scan in scanchain.open_log("office.mcap", end_s=3.0):
-    placed = localizer.process(scan)
-print(placed.state)  # -> localized
+placed = [localizer.process(scan) for scan in scanchain.open_log("office.mcap", end_s=3.0)]
+print(placed[-1].state)  # -> localized

@@ -12,7 +12,8 @@ Path("logs").mkdir()
 for seed in range(2):  # your logs, in a folder that all nodes see
     scanchain.simulate("office", f"logs/office_{seed}.mcap", duration_s=2.0, seed=seed)
 
-address = ray.init(num_cpus=2, include_dashboard=False).address_info["gcs_address"]  # of your cluster: auto
+ray.init(num_cpus=2, include_dashboard=False)  # a cluster of this machine; elsewhere: ray start --head
+address = ray.get_runtime_context().gcs_address  # or auto
 batch = ["scanchain", "batch", "logs", "--out", "runs/all", "--rerun", "off", "--ray", address]
 subprocess.run(batch, check=True, capture_output=True)  # again: only the logs without a result
 ray.shutdown()

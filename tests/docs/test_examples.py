@@ -10,7 +10,6 @@ Whole numbers agree exactly, others within one unit of the last digit shown.
 
 import ast
 import json
-import os
 import re
 import shlex
 import shutil
@@ -137,11 +136,12 @@ def test_every_example_prints_what_the_page_says(page, folder, capsys, monkeypat
     [pytest.param(script, marks=[pytest.mark.slow] * (script.stem == "ray_batch")) for script in SCRIPTS],
     ids=lambda script: script.stem,
 )
-def test_every_script_prints_what_it_says(script, folder, capsys):
+def test_every_script_prints_what_it_says(script, folder, capsys, monkeypatch):
+    monkeypatch.setattr(jackknife, "LONGEST", SHORT_WINDOWS)
     source = script.read_text(encoding="utf-8")
     if "import ray" in source:
         pytest.importorskip("ray", reason="the extra cluster is not installed")
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     assert run_python(source, script.name, capsys) or script.name.startswith("my_")
 
 

@@ -24,8 +24,8 @@ class DriftingOdometry:
     def __getattr__(self, name):
         return getattr(self.odometry, name)
 
-    def place(self, scan):
-        tracked = self.odometry.place(scan)
+    def process(self, scan):
+        tracked = self.odometry.process(scan)
         motion = lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar
         self.T_odom_lidar = tracked.T_odom_lidar
         self.T_drifted = lie.normalize(self.T_drifted @ self.drifted(motion))
