@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import count
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,10 +12,11 @@ FONT = 8.0  # height of text in points
 _DIGIT = 0.64  # width of a digit as a fraction of the text height
 _GAP = 4.0  # smallest gap between two numbers in points
 _MARGIN = 0.05  # margin on either side, as a fraction of the range of the values
-_MOST = 9  # largest number of intervals between ticks
-_ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)  # steps between ticks, times a power of ten
-_WITHIN_DECADES = ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))  # ticks per decade: the first set that fits
-_TINY = 1e-9
+_MOST = 10  # largest number of ticks
+_ROUND = "1", "2", "2.5", "5"  # steps between ticks, times a power of ten
+_DECADES = ("125", 1), ("13", 1), ("1", 1), ("1", 2), ("1", 3), ("1", 10), ("1", 50)  # ticks, in every n-th decade
+_FEW = 100.0  # ratio of the ends up to which a logarithmic axis with fewer than three decades has round steps
+_TINY = 1e-9  # share of a step by which the end of a range may miss a tick
 
 
 def width_of(text: str) -> float:
@@ -26,9 +30,8 @@ class Axis:
     is_logarithmic : whether the scale is logarithmic; only values above zero are drawn on it
     """
 
-    def __init__(self, *, is_logarithmic: bool = False) -> None:
-        self.is_logarithmic = is_logarithmic
-        self.label = ""
+    def __init__(self, label: str = "", *, is_logarithmic: bool = False) -> None:
+        self.label, self.is_logarithmic = label, is_logarithmic
         self._least, self._greatest = np.inf, -np.inf
         self._limits: tuple[float, float] | None = None
 
@@ -64,47 +67,30 @@ class Axis:
         return (values - low) / (high - low)
 
     def ticks(self, length: float, *, is_upright: bool) -> list[tuple[float, str]]:
-        """Fraction and label of each tick on an axis of this length in points."""
+        """Fraction and label of each tick on an axis of this length in points: the finest that fit."""
+        for values, texts in self._candidates():
+            places = self.fractions(np.array(values, np.float64))
+            sizes = np.array([FONT if is_upright else width_of(text) for text in texts])
+            room = length * np.abs(np.diff(places)) - 0.5 * (sizes[1:] + sizes[:-1])
+            if len(values) <= _MOST and room.min(initial=_GAP) >= _GAP:
+                labels = [text.replace("-", "−") for text in texts]
+                return list(zip(places.tolist(), labels, strict=True))
+        raise AssertionError("the largest step has one tick at most")
+
+    def _candidates(self) -> Iterator[tuple[list[float], list[str]]]:
+        """Ticks and their labels, finest first: of decades, of round steps where decades are too far apart."""
         low, high = min(self.ends), max(self.ends)
-        values = self._decades(low, high, length, is_upright)
-        texts = [f"{value:g}" for value in values]
-        if not values:
-            crowded = (high - low) / (high * np.log(high / low)) if self.is_logarithmic else 1.0  # at its end
-            values, texts = _round_steps(low, high, crowded * length, is_upright)
-        places = self.fractions(np.array(values, np.float64)).tolist()
-        return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]
-
-    def _decades(self, low: float, high: float, length: float, is_upright: bool) -> list[float]:
-        """Powers of ten, and the ticks between them that fit; none on a linear axis."""
-        if not self.is_logarithmic:
-            return []
-        exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-        every, within = exponents[:: -(-len(exponents) // _MOST)], []
-        for factors in _WITHIN_DECADES:
-            values = [float(f"{factor * 10.0**exponent:.0e}") for exponent in every for factor in factors]
-            within = [value for value in values if low <= value <= high]
-            room = length * np.log((*factors, 10.0)[1]) / np.log(high / low) - _GAP
-            widest = FONT if is_upright else max((width_of(f"{value:g}") for value in within), default=0.0)
-            if len(within) <= _MOST and widest <= room:
-                break
-        return within if len(within) > 2 else []
-
-
-def _round_steps(low: float, high: float, length: float, is_upright: bool) -> tuple[list[float], list[str]]:
-    """Multiples of the smallest round step whose labels do not overlap, and these labels."""
-    most = int(np.clip(length / FONT / (2.0 if is_upright else 3.0), 1, _MOST))
-    values: list[float] = []
-    texts: list[str] = []
-    for intervals in range(most, 0, -1):
-        least = (high - low) / intervals
-        exponent = int(np.floor(np.log10(least)))
-        factor = next(each for each in _ROUND if each * 10.0**exponent >= least * (1.0 - _TINY))
-        step = factor * 10.0**exponent
-        decimals = max(0, (factor == 2.5) - exponent - (factor == 10.0))
-        first, last = int(np.ceil(low / step - _TINY)), int(np.floor(high / step + _TINY))
-        values = [number * step for number in range(first, last + 1)]
-        texts = [f"{value + 0.0:.{decimals}f}" for value in values]
-        room = length * step / (high - low) - _GAP
-        if is_upright or len(values) < 2 or max(map(width_of, texts)) <= room:
-            break
-    return values, texts
+        if self.is_logarithmic:
+            exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+            for factors, every in _DECADES:
+                decades = [float(f"{factor}e{exponent}") for exponent in exponents[::every] for factor in factors]
+                values = [value for value in decades if low <= value <= high]
+                if len(values) > 2 or high > _FEW * low:
+                    yield values, [f"{value:g}" for value in values]
+        least = (high - low) / _MOST
+        for exponent in count(int(np.floor(np.log10(least)))):
+            for step in (float(f"{factor}e{exponent}") for factor in _ROUND):
+                if step >= least:
+                    values = step * np.arange(np.ceil(low / step - _TINY), high / step + _TINY) + 0.0
+                    decimals = len(np.format_float_positional(step, trim="-").partition(".")[2])
+                    yield values.tolist(), [f"{value:.{decimals}f}" for value in values]
