@@ -147,7 +147,7 @@ def test_closures_are_counted_by_verdict_and_cause_and_where_none_was_tried_the_
         ("2", "30", "30", "small overlap"), ("1", "90", "10", "verified"), ("1", "80", "30", "few points"),
     ]  # fmt: skip
     (section,) = loop_section(path, closures[:0], "Loop closures")
-    assert "of 8.0 m did not return to a place after loops.min_travel_m" in section.text
+    assert "of 8.0 m does not revisit a place after loops.min_travel_m" in section.text
 
 
 def test_a_run_says_its_verdict_and_result_first_and_its_time_last(one_run, pages, seen):

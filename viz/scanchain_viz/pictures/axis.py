@@ -13,7 +13,7 @@ _DIGIT = 0.64  # width of a digit as a fraction of the text height
 _GAP = 4.0  # smallest gap between two numbers in points
 _MARGIN = 0.05  # margin on either side, as a fraction of the range of the values
 _MOST = 10  # largest number of ticks
-_ROUND = "1", "2", "2.5", "5"  # steps between ticks, times a power of ten
+_ROUND = "125"  # steps between ticks, times a power of ten
 _DECADES = ("125", 1), ("13", 1), ("1", 1), ("1", 2), ("1", 3), ("1", 10), ("1", 50)  # ticks, in every n-th decade
 _FEW = 100.0  # ratio of the ends up to which a logarithmic axis with fewer than three decades has round steps
 _TINY = 1e-9  # share of a step by which the end of a range may miss a tick
@@ -92,5 +92,4 @@ class Axis:
             for step in (float(f"{factor}e{exponent}") for factor in _ROUND):
                 if step >= least:
                     values = step * np.arange(np.ceil(low / step - _TINY), high / step + _TINY) + 0.0
-                    decimals = len(np.format_float_positional(step, trim="-").partition(".")[2])
-                    yield values.tolist(), [f"{value:.{decimals}f}" for value in values]
+                    yield values.tolist(), [f"{value:.{max(-exponent, 0)}f}" for value in values]

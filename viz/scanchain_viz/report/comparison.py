@@ -32,7 +32,7 @@ def write_compare_report(directory: Path) -> None:
         ("log", table.log),
         ("topic", table.topic),
         ("scans", f"{table.scans:,} of {table.points_per_scan:,.0f} points, {table.dimension}D"),
-        ("runs of a method", str(table.repeats)),
+        ("runs per method", str(table.repeats)),
         ("machine", f"{made.platform}, {made.cores} cores"),
         ("made", sections.when(made)),
     )

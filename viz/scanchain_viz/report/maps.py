@@ -31,7 +31,7 @@ _HEADS = (
     page.Head("session"),
     page.Head("from", "UTC", is_text=True),
     page.Head("keyframes"),
-    page.Head("closures", "", "closures in force between this session and those of other maps"),
+    page.Head("closures", "", "closures accepted between this session and those of other maps"),
 )
 _GONE = page.Head("removed", "points", "points of its keyframes that newer sessions saw through")
 STATE_COLORS = {
@@ -41,9 +41,9 @@ STATE_COLORS = {
     MapState.OUTSIDE: "#6a5acd",
     MapState.LOST: "#d6453d",
 }
-_PLACED_LATER = "#0f9bb5"
+_AFTERWARDS = "#0f9bb5"
 _ROWS, _CLOSE_UPS = 200, 12
-_AROUND_M = 3.0  # margin around a cluster in a close-up
+_AROUND_SIZE, _AROUND_M = 1.5, 1.0  # half the size of a close-up: times that of its cluster, plus meters
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
 _HEX = {label: f"#{bytes(COLORS[label]).hex()}" for label in Label}
 _HOW_LABELED = (
@@ -71,7 +71,7 @@ def write_merge_report(directory: Path) -> None:
 def _merge_facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
     yield "sessions", f"{len(m.sessions)} of {len(m.sessions) + sum(map(len, m.apart))}"
     yield "keyframes", f"{m.keyframes:,}"
-    yield "closures", f"{m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force"
+    yield "closures", f"{m.closures_tried:,} tried between maps, {m.closures_in_force:,} accepted"
     yield "pose graph", m.fit
     yield "certificate", m.certificate
     yield "map", counted(m.map_points, "point")
@@ -86,7 +86,7 @@ def _merged_map(directory: Path, drawn: maps.DrawnMerge) -> page.Section:
     drawings = (
         page.Drawing.of(
             "Sessions over the map",
-            "Seen from above; thin lines: closures in force between sessions.",
+            "Seen from above; thin green lines: accepted closures between sessions.",
             maps.over_map([closures, *drawn.sessions], points, low, high),
         ),
         page.interactive_map(points, drawn.sessions, low, high, grain_m=grain_m, is_flat=is_flat),
@@ -131,7 +131,7 @@ def _localized(localized: LocalizedLog) -> Iterator[page.Section]:
         page.Row(each.name, (f"{each.keyframes:,}", page.date(each.first_stamp_ns)))
         for each in localized.prior.sessions
     ]
-    heads = (page.Head("session"), page.Head("keyframes"), page.Head("begins", "UTC"))
+    heads = (page.Head("session"), page.Head("keyframes"), page.Head("begins", "UTC", is_text=True))
     yield page.Section("The map", grid=page.Grid(heads, sessions))
 
 
@@ -142,12 +142,12 @@ def _path_section(localized: LocalizedLog) -> page.Section:
     low, high = maps.surroundings(ends, [points])
     later = found.is_placed & (found.states == MapState.SEARCHING)
     path = np.where(later[:, None], final, np.nan)
-    lines = [Line("placed afterwards", path, _PLACED_LATER, 1.2, is_dashed=True)] if later.any() else []
+    lines = [Line("localized afterwards", path, _AFTERWARDS, 1.2, is_dashed=True)] if later.any() else []
     for state, color in STATE_COLORS.items():
         if (is_in := found.states == state).any():
             lines.append(Line(state, np.where(is_in[:, None], live, np.nan), color))
     figure = maps.over_map(lines, points, low, high, path=ends, is_wide=True)
-    drawing = page.Drawing.of("Path over the map", "Circle: first scan placed; square: last.", figure)
+    drawing = page.Drawing.of("Path over the map", "Circle: first scan localized; square: last.", figure)
     text = "As estimated at the time of each scan; dashed parts were localized afterwards, by smoothing."
     return page.Section("Path in the map", text, lines, [drawing])
 
@@ -155,7 +155,7 @@ def _path_section(localized: LocalizedLog) -> page.Section:
 def _states_picture(localized: LocalizedLog) -> page.Drawing:
     """Standard deviation of the position and state, over the path."""
     found = localized.localization
-    figure = Plot("path [m]", "sigma [m]", height_inches=2.0, is_wide=True)
+    figure = Plot("distance traveled [m]", "standard deviation [m]", height_inches=2.0, is_wide=True)
     runs = np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
@@ -163,8 +163,7 @@ def _states_picture(localized: LocalizedLog) -> page.Drawing:
         figure.span(first_m, last_m, f"{STATE_COLORS[MapState(str(found.states[run[0]]))]}40")
     figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
-    count = counted(len(found.closures), "match with the map", "matches with the map")
-    text = f"Background: the state, in the colors above; {count} tried."
+    text = "Background: the state, in the colors above."
     return page.Drawing.of("Standard deviation of the position", text, figure)
 
 
@@ -178,8 +177,8 @@ def write_changes_report(directory: Path, changes: Changes) -> None:
         ("resolution", f"{changes.voxel_size_m:g} m, scans up to {changes.reach_m:.0f} m"),
         *((label.name.lower(), f"{counts[label]:,} points") for label in _ORDER),
     )
-    title = f"{changes.names[0]} and, later, {changes.names[1]}"
-    page.write_page(directory, page.Page("Changes", title, facts, sections=list(_changed(changes))))
+    subtitle = f"from {changes.names[0]} to {changes.names[1]}"
+    page.write_page(directory, page.Page("Changes", subtitle, facts, sections=list(_changed(changes))))
 
 
 def _changed(changes: Changes) -> Iterator[page.Section]:
@@ -194,7 +193,8 @@ def _changed(changes: Changes) -> Iterator[page.Section]:
         yield page.Section("What changed", grid=_cluster_grid(changes))
         drawings = []
         for each in changes.clusters[:_CLOSE_UPS]:
-            center, half_m = np.append(each.center[:2], 0.0), 0.5 * float(each.size_m[:2].max()) + _AROUND_M
+            center = np.append(each.center[:2], 0.0)
+            half_m = _AROUND_SIZE * float(each.size_m[:2].max()) + _AROUND_M
             figure = _changes_picture(points, changes, center - half_m, center + half_m)
             drawings.append(page.Drawing.of(f"{each.number}: {each.kind}", counted(each.points, "point"), figure))
         yield page.Section("The largest changes", drawings=drawings, is_small=True)

@@ -206,7 +206,7 @@ def loop_section(trajectory: DrawnTrajectory, closures: pa.Table | None, title: 
         yield Section(title, text, grid=_verdict_grid(closures))
     elif closures is not None:
         path = f"the trajectory of {trajectory.distance_m[-1]:.1f} m"
-        yield Section(title, f"None was tried: {path} did not return to a place after loops.min_travel_m.")
+        yield Section(title, f"None was tried: {path} does not revisit a place after loops.min_travel_m.")
 
 
 def _verdict_grid(closures: pa.Table) -> Grid:
