@@ -14,10 +14,9 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError, MissingExtraError
 from scanchain.files import Address, source_of
 from scanchain.logs import files, open_log, writer
-from scanchain.logs.mcap.index import Walk
-from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.stream import complete
+from scanchain.logs.mcap.index import Walk, empty_index
 from scanchain.logs.opening import index_files
+from scanchain.logs.stream import complete
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate
 from tests.support.sensor_files import flaser, save
@@ -62,7 +61,7 @@ def same_scans(first, second):
 def test_an_index_by_the_summary_is_that_of_walking_the_file(site, log_file):
     (local,), (asked,) = index_files([log_file]), index_files([Address(site.log)])
     assert len(site.asked) == 2 and site.sent <= 65_537  # the last byte, and the tail
-    walk = FileIndex(log_file, 0, log_file.read_bytes())
+    walk = empty_index(log_file, 0, log_file.read_bytes())
     Walk(walk).walk()
     complete(walk)
     assert asked.blocks == walk.blocks and all(block.head for block in asked.blocks)

@@ -12,9 +12,8 @@ from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
-from scanchain.logs import open_log
+from scanchain.logs import open_log, stream
 from scanchain.logs.info import describe
-from scanchain.logs.mcap import stream
 from scanchain.logs.opening import index_files
 from tests.support import made
 from tests.support.naive_logs import (

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from scanchain.logs.mcap.records import Channel
+from scanchain.logs.index import Channel
 from scanchain.logs.messages.lidar import decode_cloud, decode_laser_scan
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.readers import (

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanchain.logs.mcap.stream import EVERYTHING, decoded_messages
 from scanchain.logs.opening import index_files
+from scanchain.logs.stream import EVERYTHING, decoded_messages
 from scanchain.logs.writer import LogWriter, pack_cloud, pack_laser_scan
 from scanchain.simulation import SENSORS, plan, record
 from scanchain.simulation.sensors import _planar

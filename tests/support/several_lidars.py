@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from scanchain.logs import open_log
-from scanchain.logs.mcap import stream
+from scanchain.logs import open_log, stream
 from scanchain.logs.messages.readers import reader
 from scanchain.logs.topics import topics_of
 from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_transforms, place

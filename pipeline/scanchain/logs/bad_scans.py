@@ -10,7 +10,7 @@ import numpy as np
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError, counted, duration
-from scanchain.logs.mcap.records import Decoded
+from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.publishers import Publisher
 

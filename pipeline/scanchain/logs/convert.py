@@ -12,9 +12,9 @@ from msgspec.structs import replace
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
+from scanchain.logs import stream
+from scanchain.logs.index import Decoded, FileIndex, name_of
 from scanchain.logs.log import Log
-from scanchain.logs.mcap import stream
-from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
 from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, topics_of
@@ -54,7 +54,7 @@ def convert(
     indexes = index_files(sources, config)
     is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
     is_part = (config.topic, config.start_s, config.end_s, config.every) != _WHOLE
-    is_mcap = indexes[0].make is None and indexes[0].path.name.endswith(".mcap") and config.format == AUTO
+    is_mcap = indexes[0].path.name.endswith(".mcap") and config.format == AUTO
     if len(indexes) == 1 and is_mcap and not is_folder and not is_part:
         raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)

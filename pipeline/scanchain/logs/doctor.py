@@ -20,9 +20,9 @@ from scanchain.errors import counted
 from scanchain.files import Source
 from scanchain.logs.bad_scans import most_bad_scans
 from scanchain.logs.log import Log, open_log
-from scanchain.logs.mcap.stream import whole_span
 from scanchain.logs.messages.point_times import UNITS_S
 from scanchain.logs.messages.readers import is_scan
+from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
 _GAP_PERIODS = 2.5

@@ -10,11 +10,11 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
 from scanchain.logs.files import size_of
+from scanchain.logs.index import FileIndex
 from scanchain.logs.log import Log
-from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.stream import ends_of, whole_span
 from scanchain.logs.messages.readers import has_poses, kind
 from scanchain.logs.opening import index_files
+from scanchain.logs.stream import ends_of, whole_span
 from scanchain.logs.topics import find_ground_truth, find_odometry, other_sensors, topics_of
 
 

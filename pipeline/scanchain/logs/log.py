@@ -19,9 +19,9 @@ from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import OtherPoints, Pose, Scan, Trajectory
 from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
+from scanchain.logs import stream
 from scanchain.logs.bad_scans import ScanCounts, defect
-from scanchain.logs.mcap import stream
-from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
+from scanchain.logs.index import Decoded, FileIndex, name_of
 from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
 from scanchain.logs.messages.point_times import UNTIMED, PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose

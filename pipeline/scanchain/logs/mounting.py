@@ -12,10 +12,10 @@ from scanchain import lie
 from scanchain.config import LogConfig
 from scanchain.data import Pose
 from scanchain.errors import InputError
-from scanchain.logs.mcap.records import Channel, FileIndex, name_of
-from scanchain.logs.mcap.stream import Span, sampled_messages
+from scanchain.logs.index import Channel, FileIndex, name_of
 from scanchain.logs.messages.poses import Frames, StampedPose, chain
 from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, reader, role
+from scanchain.logs.stream import Span, sampled_messages
 from scanchain.logs.topics import find_odometry, topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")

@@ -20,9 +20,9 @@ from scanchain.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
 from scanchain.logs.formats.ros1_bag import index_ros1_bag
 from scanchain.logs.formats.ros2_bag import index_ros2_bag, parts_of_bag
 from scanchain.logs.formats.user import index_scans
+from scanchain.logs.index import FileIndex
 from scanchain.logs.mcap.index import index_by_summary, index_file
-from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.stream import are_parts, complete
+from scanchain.logs.stream import are_parts, complete
 
 FORMATS: dict[str, tuple[str, Callable[..., FileIndex]]] = {  # with descriptions for errors; see _format_of
     "mcap": ("MCAP", index_file),

@@ -11,7 +11,7 @@ import numpy as np
 
 from scanchain.data import OtherPoints, Pose, RawPoints
 from scanchain.errors import duration
-from scanchain.logs.mcap.records import Decoded
+from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns, moved
 from scanchain.logs.mounting import TILTED_RAD, place_text, tilt_rad
 

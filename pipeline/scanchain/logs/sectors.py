@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import RawPoints
 from scanchain.errors import counted
-from scanchain.logs.mcap.records import Decoded
+from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 

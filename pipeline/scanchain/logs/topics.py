@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from scanchain.config import NO_TRUTH, LogConfig
 from scanchain.errors import InputError
-from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
+from scanchain.logs.index import Channel, FileIndex, damage_of, name_of
 from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_moving_transforms, kind, role
 
 _MOST_LISTED = 8

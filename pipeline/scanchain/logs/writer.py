@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.logs.mcap.records import Channel
+from scanchain.logs.index import Channel
 from scanchain.logs.messages.ros import NUMBERS, header, new, packed, point_fields, typestore
 
 LATEST_NS = (1 << 31) * 1_000_000_000  # upper limit of ROS stamps

@@ -9,8 +9,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from scanchain.errors import InputError
+from scanchain.logs.index import Block, Channel, FileIndex
 from scanchain.logs.mcap.index import index_file
-from scanchain.logs.mcap.records import Block, Channel, FileIndex
 from scanchain.logs.writer import LogWriter, schema_text
 
 
@@ -26,7 +26,7 @@ def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
 def add_block(
     index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
 ) -> None:
-    """Append a block, which ``index.make`` finds by ``offset``; ``size`` is its approximate number of bytes."""
+    """Append a block, identified by ``offset``; ``size`` is its approximate number of bytes."""
     held = {channel.key[1]: count for channel, count in counts.items() if count}
     span = min(times_ns), max(times_ns)
     index.blocks.append(Block(index.number, offset, size, "", size, *span, held))

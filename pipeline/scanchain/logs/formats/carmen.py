@@ -21,7 +21,7 @@ import numpy as np
 
 from scanchain.errors import InputError, counted, printable
 from scanchain.logs.formats import UnknownFormatError, temporary_index
-from scanchain.logs.mcap.records import FileIndex
+from scanchain.logs.index import FileIndex
 from scanchain.logs.writer import (
     LATEST_NS,
     Link,

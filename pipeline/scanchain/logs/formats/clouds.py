@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from scanchain.errors import InputError, counted, printable
 from scanchain.logs.formats import add_block, add_channel, left_out, natural_order
-from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # a stamp's unit in nanoseconds, by its number of digits since 2001
@@ -256,7 +256,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         return contents_of(files[block.offset], channel, block.start_ns, lambda file: read_cloud_file(file, raw))
 
-    index.make = make
+    index.contents = make
     return index
 
 

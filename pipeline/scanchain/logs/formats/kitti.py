@@ -21,7 +21,7 @@ from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError, counted, shown
 from scanchain.logs.formats import add_block, add_channel, natural_order
 from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
-from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
+from scanchain.logs.index import Block, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_odometry, place
 
 _TRUTH = -1  # offset that marks the block of the ground truth
@@ -105,7 +105,7 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
         read = partial(read_raw, point=XYZI)
         return contents_of(files[block.offset], channel, block.start_ns, read, "velodyne")
 
-    index.make = make
+    index.contents = make
     return index
 
 

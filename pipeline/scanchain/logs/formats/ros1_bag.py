@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from scanchain.errors import InputError, counted
+from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message, unpack
 from scanchain.logs.mcap.index import most_unpacked
-from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message, unpack
-from scanchain.logs.mcap.stream import messages_of
+from scanchain.logs.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
@@ -151,7 +151,7 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
             raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     index = FileIndex(path, number, data)
-    index.make = partial(_contents, index)
+    index.contents = partial(_contents, index)
     head = read_record(data, len(MAGIC))
     if head is not None and head.text(b"encryptor"):
         raise InputError(f"{path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")

@@ -20,8 +20,8 @@ import zstandard
 
 from scanchain.errors import InputError, counted, one_line
 from scanchain.logs.files import size_of
+from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.mcap.index import most_unpacked
-from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import schema_text
 
 _BLOCK_BYTES = 4_000_000  # approximate size of a block in bytes of the file
@@ -75,7 +75,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
             index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
         if not reader.start_time:  # messages of log time 0, which are in the first block
             index.blocks[0] = replace(index.blocks[0], start_ns=0)
-    index.make = partial(bag.contents, index)
+    index.contents = partial(bag.contents, index)
     return index
 
 

@@ -14,7 +14,7 @@ from scanchain import plugins
 from scanchain.data import Scan
 from scanchain.errors import InputError, counted, shown
 from scanchain.logs.formats import temporary_index
-from scanchain.logs.mcap.records import FileIndex
+from scanchain.logs.index import FileIndex
 from scanchain.logs.writer import LATEST_NS, LogWriter
 
 _TOPIC, _FRAME = "/points", "lidar"

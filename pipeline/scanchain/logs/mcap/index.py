@@ -12,9 +12,10 @@ import mmap
 import struct
 import zlib
 from collections import Counter, deque
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from io import BytesIO
 from pathlib import Path
 
@@ -25,8 +26,10 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from scanchain.errors import InputError
+from scanchain.files import Source
 from scanchain.logs.files import RemoteFile
-from scanchain.logs.mcap.records import CHUNK_HEAD, MALFORMED, MESSAGE_HEAD, RECORD, Block, FileIndex, definition
+from scanchain.logs.index import Block, FileIndex
+from scanchain.logs.mcap.records import CHUNK_HEAD, MALFORMED, MESSAGE_HEAD, RECORD, contents, define, definition
 
 # least number of bytes of a record's body
 _LEAST_BYTES = {Opcode.HEADER: 8, Opcode.MESSAGE: MESSAGE_HEAD.size, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8}
@@ -53,9 +56,10 @@ def index_file(path: Path, number: int) -> FileIndex:
         raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
-    index = FileIndex(path, number, data)
+    index = empty_index(path, number, data)
     if not _take_summary(index, len(data), needs_crc=True):
-        index = FileIndex(path, number, data, is_consistent=False)
+        index = empty_index(path, number, data)
+        index.is_consistent = False
         Walk(index).walk()
     return index
 
@@ -65,8 +69,17 @@ def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
 
     Any other file has to be walked, which takes all its bytes.
     """
-    index = FileIndex(file.address, number, b"", lru_cache(_REPEATED)(file.read))
+    index = empty_index(file.address, number, fetch=lru_cache(_REPEATED)(file.read))
     return index if _take_summary(index, file.size, needs_crc=False) else None
+
+
+def empty_index(
+    path: Source, number: int, data: mmap.mmap | bytes = b"", fetch: Callable[[int, int], bytes] | None = None
+) -> FileIndex:
+    """Index of an MCAP file to which no record has been added yet."""
+    index = FileIndex(path, number, data, fetch)
+    index.contents = partial(contents, index)
+    return index
 
 
 def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
@@ -104,7 +117,7 @@ def _fill(index: FileIndex, summary: bytes) -> Statistics | None:
     statistics = None
     for record in StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True).records:
         if isinstance(record, Schema | Channel):
-            index.define(record)
+            define(index, record)
         elif isinstance(record, ChunkIndex):
             index.blocks.append(_indexed(record, index.number))
         elif isinstance(record, Statistics):
@@ -189,7 +202,7 @@ class Walk:
             if count := (end - body - 6) // 16:
                 self.open.counts[channel] = self.open.counts.get(channel, 0) + count
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            index.define(definition(opcode, self.data[body:end]))
+            define(index, definition(opcode, self.data[body:end]))
         else:
             self._close(offset, complete=True)
 

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from scanchain.data import Pose
-from scanchain.logs.mcap.records import Channel
+from scanchain.logs.index import Channel
 from scanchain.logs.messages.lidar import Sensed
 from scanchain.logs.messages.poses import Frames, StampedPose, pose_of
 from scanchain.logs.messages.ros import MalformedMessageError, frame_name, header, new, point_fields

@@ -17,7 +17,7 @@ from scanchain.config import LogConfig
 from scanchain.data import RawPoints
 from scanchain.errors import counted
 from scanchain.kernels.geometry import largest_magnitude
-from scanchain.logs.mcap.records import Decoded
+from scanchain.logs.index import Decoded
 
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False

@@ -13,7 +13,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Pose, Trajectory
 from scanchain.errors import counted
-from scanchain.logs.mcap.records import Decoded
+from scanchain.logs.index import Decoded
 from scanchain.logs.messages.ros import MalformedMessageError, frame_name, stamp_ns
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, get_type_hints
 
-from scanchain.logs.mcap.records import Channel
+from scanchain.logs.index import Channel
 from scanchain.logs.messages import foxglove
 from scanchain.logs.messages.lidar import Sensed, read_livox, read_multi_echo_scan
 from scanchain.logs.messages.poses import Frames, read_pose, read_transforms

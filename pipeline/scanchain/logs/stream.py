@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, duration
-from scanchain.logs.mcap.records import (
+from scanchain.logs.index import (
     Block,
     DamagedBlockError,
     Decoded,
