@@ -243,7 +243,7 @@ def test_a_log_cut_off_is_read_up_to_the_damage_and_the_damage_is_told(call, tmp
     assert run.code == 0 and 30 < count < 60
     assert all(line.startswith("warning: ") for line in run.errors.splitlines())
     for text in (run.errors, run.output):
-        says(text, "cut off", f"{count} scans of /scan were recovered")
+        says(text, "truncated", f"{count} scans of /scan were recovered")
     assert json.loads((run.folder / "run.json").read_text())["complete"]
-    says(call("info", path)[1], "damage ", "cut off")
+    says(call("info", path)[1], "damage ", "truncated")
     assert json.loads(call("info", path, "--json")[1])["damage"]

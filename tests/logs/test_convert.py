@@ -141,7 +141,7 @@ def test_a_part_of_a_log_is_written_by_the_keys_that_a_run_takes(tmp_path, capfd
         (["absent", "out.mcap"], "no such file"),
         (["empty", "out.mcap"], "is a folder without a recognized log"),
         (["a.log", "taken.mcap"], "exists"),
-        (["bad.log", "out.mcap"], "no message that could be read"),
+        (["bad.log", "out.mcap"], "no readable message"),
         (
             ["a.log", "out.mcap", "--log.min_range_m", "1"],
             "--log.min_range_m has no meaning for convert; its keys are log.format, log.rate_hz",

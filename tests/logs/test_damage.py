@@ -60,7 +60,7 @@ BLIND = scan_said(STAMP_NS, laser_scan(STAMP_NS, [np.nan, np.inf, 0.0, 40.0]))
 TEXT = b"# A title\n\nSome words.\n"
 EDGE = "\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
 NO_LOG, NO_CARMEN = "is not a recognized log", "is not a recognized log (text without a line of FLASER"
-GRAPH = "is a pose graph, no log; give it to scanchain optimize"
+GRAPH = "is a pose graph, not a log; use scanchain optimize"
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ GRAPH = "is a pose graph, no log; give it to scanchain optimize"
             (file_of((first + EDGE).encode(), "a.g2o"), {}, [GRAPH])
             for first in ("VERTEX_SE2 0 0 0 0", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "EDGE2 0 1 1 0 0", "FIX 0")
         ),
-        (file_of(b"#ROSBAG V2.0\n"), {}, ["holds: none"]),
+        (file_of(b"#ROSBAG V2.0\n"), {}, ["contains: none"]),
         (file_of(b"#ROSBAG V2.0\n" * 10), {}, ["damaged to its end, at byte 13"]),
         (file_of(b"#ROSBAG V1.2\n"), {}, ["rosbag migrate"]),
         (file_of(b"SQLite format 3\0"), {}, ["cannot be read as a ROS bag"]),
@@ -224,7 +224,7 @@ def test_a_chunk_whose_opcode_is_damaged_is_read_all_the_same_and_told(tmp_path,
     (tmp_path / "a.mcap").write_bytes(whole)
     log = open_log(tmp_path / "a.mcap")
     assert len(list(log.scans())) == 40
-    says(" ".join(log.damage), f"at byte {begin} is marked as another record")
+    says(" ".join(log.damage), f"at byte {begin} has another opcode")
 
 
 def test_an_unknown_compression_is_named(tmp_path):

@@ -151,7 +151,7 @@ def test_of_a_database_with_one_page_destroyed_all_other_messages_are_read(tmp_p
         whole = [stamp for stamp, points in scans.items() if np.array_equal(points, healthy[stamp])]
         assert len(whole) >= len(healthy) - 1 - 3 * (page in tables), (page, log.damage)
         if log.damage or len(scans) < len(healthy):
-            says(log.damage[0], "of 80 messages lost: damaged pages", "the others were read row by row")
+            says(log.damage[0], "of 80 messages lost in damaged pages", "the others are read row by row")
             lost = int(log.damage[0].removeprefix(f"{opened}: ").split()[0])
             assert len(healthy) - len(scans) <= lost <= 8
     for page in vital:
@@ -197,12 +197,12 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)"""
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     count, damage, *_, more_mib = output.splitlines()
     assert int(count) == 10 and int(more_mib) < 400
-    says(damage, "2 of 12 scans of /points were left out", "unpack")
+    says(damage, "2 of 12 scans of /points were left out", "decompress")
 
 
 def test_a_packed_file_that_unpacks_without_end_is_refused(tmp_path):
     folder = bag2(tmp_path / "a", 3, compression="FILE")
     (path,) = folder.glob("*.zstd")
     path.write_bytes(zeros(1 << 30))
-    with pytest.raises(InputError, match=r"db3.zstd: unpacks to more than [\d,]+ bytes; is it a ROS 2 bag"):
+    with pytest.raises(InputError, match=r"db3.zstd: decompresses to more than [\d,]+ bytes; is it a ROS 2 bag"):
         open_log(folder)

@@ -90,8 +90,8 @@ def test_scans_without_a_point_in_range_are_left_out(call, tmp_path):
 def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(call, tmp_path):
     path = saved(tmp_path, drive(ranges=covered(*range(40))))
     found = diagnose(path)
-    assert (found["damage"].severity, found["damage"].remedy) == ("problem", "")
-    assert found["ranges"].remedy == "--preprocess.min_range_m 0.18"
+    assert (found["damage"].severity, found["damage"].fix) == ("problem", "")
+    assert found["ranges"].fix == "--preprocess.min_range_m 0.18"
     flags = ["--preprocess.min_range_m", "0.5", "--log.max_bad_scans_percent", "100"]
     code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off", *flags)
     assert code == 2 and errors.count("\n") == 1 and not (tmp_path / "a").exists()
@@ -105,12 +105,12 @@ def test_a_gap_is_found_where_it_is(tmp_path):
 
     path = saved(tmp_path, drive(stamp=hole, log=hole))
     finding = diagnose(path)["gaps"]
-    assert (finding.severity, finding.remedy) == ("warning", "--end 1.9")
+    assert (finding.severity, finding.fix) == ("warning", "--end 1.9")
     assert finding.found == "1 longer than 2.5 periods of 0.1 s, the longest 2.1 s, 1.9 s into the log"
     assert "at constant velocity" in finding.effect
-    assert "run what comes before it, as below, and the rest, --start 4, apart" in finding.effect
+    assert "run the part before, as below, and the rest, --start 4, separately" in finding.effect
     later = diagnose(path, start_s=1.0)["gaps"]
-    assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
+    assert (later.found, later.fix) == (finding.found, finding.fix)  # the flag counts from the same moment
     path = saved(tmp_path, drive(stamp=hole, log=hole, wheels=True))
     on_wheels = diagnose(path)["gaps"]
     assert on_wheels.severity == "note" and "by the wheels" in on_wheels.effect
@@ -162,16 +162,22 @@ IN_MILLIMETERS = [odometry_said(at_times(k), odometry(at_times(k), 100.0 * k, 0.
 
 
 @pytest.mark.parametrize(
-    ("said", "check", "severity", "found", "remedy"),
+    ("said", "check", "severity", "found", "fix"),
     [
-        (drive(stamp=lambda k: -at_times(k)), "damage", "warning", "have the header stamp of the one before", ""),
+        (
+            drive(stamp=lambda k: -at_times(k)),
+            "damage",
+            "warning",
+            "have the header stamp of the previous one",
+            "",
+        ),
         (drive(stamp=lambda k: -at_times(k)), "gaps", "ok", "none longer", ""),  # by log time
         (drive(wheels=True, stamp=lambda k: -37 * SECOND), "wheels", "warning", "40 of 40 scans without", ""),
         (drive(wheels=True, mounted=False), "wheels", "note", "no static transform from base_link", ""),
         ([*drive(), *IN_MILLIMETERS], "wheels", "problem", "moves at 1e+03 m/s", NO_WHEELS),
         (drive(ranges=mostly_lost), "returns", "warning", "80 % of the beams without a valid return, 20", ""),
-        (drive(ranges=blind_until(25, 40)), "returns", "warning", "3 valid a scan", "--start 2.5"),
-        (drive(ranges=blind_until(5, 30)), "returns", "warning", "100 valid a", "--start 0.5 --end 2.901"),
+        (drive(ranges=blind_until(25, 40)), "returns", "warning", "3 valid per scan", "--start 2.5"),
+        (drive(ranges=blind_until(5, 30)), "returns", "warning", "100 valid per", "--start 0.5 --end 2.901"),
         (drive(ranges=blind_until(0, 40)), "returns", "ok", "0 % of the beams", ""),
         (drive(ranges=stuck), "no return", "warning", "15 % of the beams have exactly 29.99 m", NO_RETURN),
         (drive(ranges=lambda k: 1e3 * room(k)), "ranges", "problem", "98 % of the returns lie between", ""),
@@ -180,23 +186,23 @@ IN_MILLIMETERS = [odometry_said(at_times(k), odometry(at_times(k), 100.0 * k, 0.
         (drive(ranges=lambda k: room(min(k, 20))), "duplicates", "warning", "20 of them in a row", ""),
         (sweeps(), "point times", "ok", "field time (float32) taken as s after the stamp", ""),
         (sweeps(span=9.5), "point times", "warning", "95 of the period", "--log.point_times none"),  # no unit fits
-        (sweeps(span=0.0), "point times", "note", "field time (float32) is there and constant (0)", ""),
+        (sweeps(span=0.0), "point times", "note", "field time (float32) is constant (0)", ""),
         (sweeps(fields=np.dtype(ROW.descr[:3])), "point times", "note", "none", ""),  # in no order
     ],
 )
 def test_a_fault_is_measured_and_graded_and_mended_by_the_flag_of_a_log(
-    tmp_path, said, check, severity, found, remedy
+    tmp_path, said, check, severity, found, fix
 ):
     path = saved(tmp_path, said)
     finding = diagnose(path)[check]
-    assert (finding.severity, finding.remedy) == (severity, remedy)
+    assert (finding.severity, finding.fix) == (severity, fix)
     assert found in finding.found
-    if remedy.startswith("--log."):
-        words = remedy.split()
+    if fix.startswith("--log."):
+        words = fix.split()
         keys = [flag.removeprefix("--log.") for flag in words[::2]]
         values = [float(value) if value[0].isdigit() else value for value in words[1::2]]
         mended = diagnose(path, **dict(zip(keys, values, strict=True)))[check]
-        assert (mended.severity, mended.remedy) == ("note" if values[0] == "none" else "ok", "")
+        assert (mended.severity, mended.fix) == ("note" if values[0] == "none" else "ok", "")
 
 
 def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
@@ -205,7 +211,7 @@ def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
     said[9] = scan_said(said[9].log_ns, laser_scan(said[9].log_ns, np.full(100, np.nan)))
     path = saved(tmp_path, said)
     finding = diagnose(path, max_bad_scans_percent=2.0)["damage"]
-    assert finding.severity == "problem" and finding.remedy == "--log.max_bad_scans_percent 5"
+    assert finding.severity == "problem" and finding.fix == "--log.max_bad_scans_percent 5"
     assert "2 of 40 scans of /scan were left out (the first: " in finding.found
     for percent in (5.0, LogConfig().max_bad_scans_percent):
         finding = diagnose(path, max_bad_scans_percent=percent)["damage"]
@@ -215,7 +221,7 @@ def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
 def test_a_wrong_unit_of_point_times_is_found_and_mended_by_its_flag(tmp_path):
     path = saved(tmp_path, sweeps())
     finding = diagnose(path, point_times="ms")["point times"]
-    assert finding.severity == "warning" and finding.remedy == "--log.point_times s"
+    assert finding.severity == "warning" and finding.fix == "--log.point_times s"
     assert diagnose(path, point_times="s")["point times"].severity == "ok"
 
 
@@ -246,7 +252,7 @@ def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_
     text = capfd.readouterr().out
     lines = [
         "GNSS /fix: not used",
-        "poses /gps: not used; --gt /gps takes them as the truth, --log.odometry_topic /gps as wheels",
+        "poses /gps: not used; --gt /gps uses them as ground truth, --log.odometry_topic /gps as wheels",
         "ground truth /ground_truth: evaluates the result, is not used for it",
         "IMU /imu/data: not used",
     ]
@@ -282,9 +288,7 @@ def test_the_command_prints_the_gravest_first_and_json_says_the_same(tmp_path, c
     said = json.loads(capfd.readouterr().out)
     grades = [finding["severity"] for finding in said["findings"]]
     assert grades == sorted(grades, key=["problem", "warning", "note", "ok"].index)
-    assert said["topic"] == "/scan" and {"check", "severity", "found", "effect", "remedy"} == set(
-        said["findings"][0]
-    )
+    assert said["topic"] == "/scan" and {"check", "severity", "found", "effect", "fix"} == set(said["findings"][0])
 
 
 def test_a_log_that_a_run_could_not_open_is_refused_in_the_same_words(tmp_path, capfd):
@@ -320,7 +324,7 @@ def test_stamps_and_log_times_of_which_one_is_in_another_unit_are_named(tmp_path
     path = saved(tmp_path, drive(stamp=stamp, log=log, beam_s=9e-4))
     opened = open_log(path)
     spans_s = [float(np.ptp(scan.times_s)) for scan in opened.scans() if len(scan.times_s)]
-    line = f"header stamps of /scan advance by {advance}: is one of them in another unit?"
+    line = f"header stamps of /scan advance by {advance}: is the unit of one of them wrong?"
     assert (line in opened.damage) == bool(advance) and len(opened.jumps) == bool(advance)
     found = diagnose(path)
     assert (found["stamps"].found == line) == bool(advance) and "unit?" not in found["damage"].found

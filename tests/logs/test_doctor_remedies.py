@@ -67,7 +67,7 @@ def test_the_flags_of_a_finding_help(tmp_path, capfd, fault):
     assert main(["doctor", str(path), "--json"]) == 0
     found = {finding["check"]: finding for finding in json.loads(capfd.readouterr().out)["findings"]}
     finding = found[FAULTS[fault]]
-    flags = shlex.split(finding["remedy"])
+    flags = shlex.split(finding["fix"])
     assert flags, finding
     before_m = figures(path, tmp_path / "a", capfd)
     after_m = figures(path, tmp_path / "a", capfd, *flags)

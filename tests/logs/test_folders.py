@@ -58,7 +58,7 @@ def test_a_calibration_that_is_no_motion_leaves_no_truth_and_one_line_of_damage(
         assert (
             "3 scans" in recovered
             and f" line {name}: " in line
-            and "download it again; until then there is no ground truth" in line
+            and "download it again; there is no ground truth until then" in line
         )
 
 
@@ -94,7 +94,7 @@ def test_a_kitti_folder_whose_parts_do_not_fit_says_so(tmp_path):
     with pytest.raises(InputError, match="does not fit the 1 timestamp;"):
         read(sequence)
     (sequence / "times.txt").write_text("noon\n")
-    with pytest.raises(InputError, match=r"times\.txt: is no table of 1 numbers"):
+    with pytest.raises(InputError, match=r"times\.txt: is not a table of 1 numbers"):
         read(sequence)
 
 
@@ -178,7 +178,7 @@ def test_files_that_are_only_numbered_need_a_rate(tmp_path):
     said = recorders.clouds(12)
     for k, cloud in enumerate(said):
         xyzi(cloud).tofile(tmp_path / f"scan{k}.bin")
-    with pytest.raises(InputError, match=r"scan0\.bin hold no stamp.*log__rate_hz 10"):
+    with pytest.raises(InputError, match=r"scan0\.bin contain no stamp.*log__rate_hz 10"):
         read(tmp_path)
     log, scans = read(tmp_path, rate_hz=20.0)
     assert_points(scans, said)  # scan2 comes before scan10
@@ -213,14 +213,14 @@ def test_a_file_that_is_broken_is_left_out_and_told(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     log, scans = read(tmp_path)
     assert [scan.stamp_ns for scan in scans] == [2 * SECOND]
-    assert name in log.damage[0] and "left out" in log.damage[0]
+    assert name in log.damage[0] and "skipped" in log.damage[0]
     assert f"is malformed: {name} " in log.damage[1]
 
 
 def test_a_run_directory_is_no_log(tmp_path):
     (tmp_path / "run.json").write_text("{}")
     (tmp_path / "map.ply").write_text("")
-    with pytest.raises(InputError, match=r"is a run directory, no log; give the log that its run\.json names"):
+    with pytest.raises(InputError, match=r"is a run directory, not a log; give the log named in its run\.json"):
         open_log(tmp_path)
 
 
@@ -241,7 +241,7 @@ def test_folders_of_arrays_open_whatever_their_columns_and_say_what_was_found(tm
         else:
             cloud.tofile(tmp_path / f"{k}.bin")
     if suffix == ".bin" and columns != 4:
-        with pytest.raises(InputError, match=r"no rows of 4 float32 numbers; .*log__bin_columns 5, or save"):
+        with pytest.raises(InputError, match=r"no multiple of 4 float32 numbers; .*log__bin_columns 5, or save"):
             read(tmp_path, rate_hz=10.0)
     log, scans = read(tmp_path, rate_hz=10.0, bin_columns=columns)
     for scan, cloud in zip(scans, clouds, strict=True):
@@ -269,7 +269,7 @@ def test_arrays_of_any_number_type_and_with_named_fields_are_read(tmp_path, kind
     [
         (np.ones((3, 900)), "is an array (3, 900) of float64; give numbers (N, 3), (N, 4)"),
         (np.ones(900), "is an array (900,) of float64"),
-        (np.array([[{}, 1, 2]]), "is no .npy array of numbers"),
+        (np.array([[{}, 1, 2]]), "is not a .npy array of numbers"),
     ],
 )
 def test_arrays_that_are_no_clouds_are_left_out_told_by_the_first_and_their_number(tmp_path, array, said):
@@ -284,13 +284,13 @@ def test_arrays_that_are_no_clouds_are_left_out_told_by_the_first_and_their_numb
 def test_a_folder_of_several_kinds_of_clouds_says_which_it_left_out(tmp_path):
     np.save(tmp_path / "1.0.npy", swept(0))
     np.save(tmp_path / "2.0.npy", swept(1))
-    assert not any("left out" in note for note in open_log(tmp_path).notes)
+    assert not any("files are read" in note for note in open_log(tmp_path).notes)
     (tmp_path / "1.5.pcd").write_text(PCD.format(count=3, form="ascii") + "1 2 3\n" * 3)
-    (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
-    assert note.startswith(f"{tmp_path}: only its .pcd files are read, left out are 2 .npy;")
+    (note,) = [note for note in open_log(tmp_path).notes if "files are read" in note]
+    assert note.startswith(f"{tmp_path}: only its .pcd files are read, not 2 .npy;")
     simulate("office", tmp_path / "part.mcap", duration_s=1.0)
-    (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
-    assert note.startswith(f"{tmp_path}: only its .mcap files are read, left out are 1 .pcd, 2 .npy;")
+    (note,) = [note for note in open_log(tmp_path).notes if "files are read" in note]
+    assert note.startswith(f"{tmp_path}: only its .mcap files are read, not 1 .pcd, 2 .npy;")
 
 
 @pytest.mark.filterwarnings("error")
@@ -304,4 +304,4 @@ def test_numbers_of_kitti_beyond_all_measure_are_damage_and_no_warnings_of_numpy
         damage = read(sequence)[0].damage[0]
     except InputError as error:
         damage = str(error)
-    assert "holds numbers that are not finite or too large" in damage
+    assert "contains numbers that are not finite or too large" in damage

@@ -124,7 +124,7 @@ def test_an_odometry_topic_comes_first_unless_tf_is_asked_for(tmp_path):
 def test_a_tf_without_odometry_that_is_asked_for_is_refused_with_what_it_holds(tmp_path):
     path = drive(tmp_path / "a.mcap", [("map", "odom")])
     with pytest.raises(
-        InputError, match=r"/tf has no transform from an odometry's frame .*; it holds: map → odom"
+        InputError, match=r"/tf has no transform from an odometry's frame .*; it contains: map → odom"
     ):
         open_log(path, odometry_topic="/tf")
 

@@ -110,7 +110,7 @@ def test_a_frame_that_cannot_be_joined_is_left_out_counted_and_named_with_the_ot
     path = write(tmp_path / "a.mcap", [static, *said], chunk_size=1_000_000)
     log, scans = read(path)
     assert len(scans) == 30 and log.mounting.T_base_lidar[0, 3] == 0.3
-    says(log.damage[0], "10 of 40 messages of /scan left out", "frame right", "used is frame left")
+    says(log.damage[0], "10 of 40 messages of /scan left out", "frame right", "the one used is frame left")
     says(
         " ".join(log.notes),
         "frame right",
@@ -131,7 +131,7 @@ def test_empty_scans_of_another_publisher_do_not_end_a_run(tmp_path):
     log, scans = read(write(tmp_path / "a.mcap", sorted([*simulated, *real], key=lambda each: each.log_ns)))
     assert len(scans) == 38 and log.bad_scans == 0
     says(log.damage[0], "40 of 78 messages", "frame simulated (stamps 900.0 to 903.9 s, 0 % with returns)")
-    says(log.damage[0], "used is frame real (stamps 1700000000.2 to 1700000003.9 s, 100 % with returns)")
+    says(log.damage[0], "the one used is frame real (stamps 1700000000.2 to 1700000003.9 s, 100 % with returns)")
 
 
 def test_a_real_lidar_beside_a_simulators_empty_scans_is_read_without_a_flag():
@@ -284,7 +284,7 @@ def test_log_times_of_0_before_the_first_clock_neither_stretch_a_log_nor_move_it
     assert "5 messages of log time 0" in log.notes[0]
     assert len(read(path, start_s=1.0)[1]) == 45 and len(read(path, end_s=1.0)[1]) == 16
     finding = diagnose(path)["gaps"]
-    assert (finding.severity, finding.remedy) == ("ok", "")
+    assert (finding.severity, finding.fix) == ("ok", "")
     (topic,) = [each for each in describe([path], LogConfig())["topics"] if each["topic"] == "/scan"]
     assert topic["rate_hz"] == pytest.approx(59 / 5.4)
     healthy = [said_by(k, "laser", stamp_ns=k * STEP_NS, log_ns=k * STEP_NS) for k in range(20)]

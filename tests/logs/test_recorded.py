@@ -182,9 +182,9 @@ def test_a_type_that_is_unknown_is_named(tmp_path, name, language, encoding):
 @pytest.mark.parametrize(
     ("language", "encoding", "data", "complaint"),
     [
-        ("jsonschema", "json", b"{", "no JSON"),
-        ("jsonschema", "json", b'{"ranges": "no"}', "does not fit its type"),
-        ("jsonschema", "json", b"[" * 100_000, "does not fit its type"),
+        ("jsonschema", "json", b"{", "not JSON"),
+        ("jsonschema", "json", b'{"ranges": "no"}', "does not match its type"),
+        ("jsonschema", "json", b"[" * 100_000, "does not match its type"),
         ("protobuf", "protobuf", b"\xff\xff\xff", r"its schema foxglove\.LaserScan is broken"),
         ("ros1msg", "ros1", b"\xff" * 40, ""),
     ],
@@ -241,7 +241,7 @@ def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(tmp_path, compression):
         log = open_log(path)
         scans = list(log.scans())
         assert_clouds(scans, sweeps[: len(scans)])
-        assert "cut off" in log.damage[0] and f"{len(scans)} scans of /points were recovered" in log.damage[-1]
+        assert "truncated" in log.damage[0] and f"{len(scans)} scans of /points were recovered" in log.damage[-1]
         counts.append(len(scans))
     assert counts == sorted(counts) and counts[0] < 9 and counts[-1] == 60
 
@@ -262,7 +262,7 @@ def test_a_damaged_chunk_of_a_bag_is_left_out_and_told(tmp_path):
     log = open_log(path)
     scans = list(log.scans())
     assert 55 <= len(scans) < 60 and len(log.damage) == 2
-    assert "the chunk at byte" in log.damage[0] and "it was left out" in log.damage[0]
+    assert "the chunk at byte" in log.damage[0] and "it is skipped" in log.damage[0]
     assert {scan.stamp_ns for scan in scans} <= {cloud.stamp_ns for cloud in sweeps}
 
 
@@ -303,7 +303,7 @@ def test_of_packed_messages_only_the_one_that_is_damaged_is_lost(tmp_path, monke
     stamps = {scan.stamp_ns for scan in scans}
     assert len(scans) == 29
     assert_clouds(scans, [sweep for sweep in sweeps if sweep.stamp_ns in stamps])
-    assert "1 of 30 scans" in log.damage[0] and "does not unpack" in log.damage[0]
+    assert "1 of 30 scans" in log.damage[0] and "cannot be decompressed" in log.damage[0]
 
 
 def test_metadata_that_is_no_yaml_or_lacks_its_files_is_told(tmp_path):

@@ -128,7 +128,7 @@ def test_a_server_without_ranges_sends_it_all_and_that_is_said(site, log_file):
     site.has_ranges = False
     log = open_log(site.log, LogConfig(end_s=1.0))
     assert same_scans(log, open_log(log_file, LogConfig(end_s=1.0)))
-    assert "lies on a server that sends no parts of files, so all" in log.notes[0]
+    assert "is on a server without byte ranges, so all" in log.notes[0]
 
 
 @pytest.mark.parametrize("spoilt", ["no summary", "cut off", "summary with a flipped bit", "chunk"])
@@ -150,7 +150,7 @@ def test_damage_is_told_of_the_address_and_a_log_without_an_index_is_fetched_who
     (tmp_path / "beside.mcap").write_bytes(data)
     log, beside = open_log(site.log), open_log(tmp_path / "beside.mcap")
     assert same_scans(log, beside)
-    assert ("has no index to read it by, so all" in " ".join(log.notes)) == (spoilt != "chunk")
+    assert ("has no complete index, so all" in " ".join(log.notes)) == (spoilt != "chunk")
     assert log.damage == [line.replace(str(tmp_path / "beside.mcap"), site.log) for line in beside.damage]
     assert bool(log.damage) == (spoilt != "no summary")
 

@@ -137,11 +137,11 @@ def test_a_gap_between_two_files_is_a_note_and_one_of_more_than_a_day_refused(tm
         return open_log([write(tmp_path / "a.mcap", office(40, begin_ns=STAMP_NS + gap_ns)), first], **config)
 
     note = next(note for note in after(23 * hour_ns).notes if note.startswith("no message for "))
-    assert note.startswith("no message for 23.0 h from 3.9 s on between b.mcap and a.mcap: read as one log ")
+    assert note.startswith("no message for 23.0 h from 3.9 s on between b.mcap and a.mcap; read as one log")
     for log in (after(23 * hour_ns, end_s=3.0), after(23 * hour_ns, start_s=23 * 3600.0), after(10 * SECOND)):
         assert not any("no message" in note for note in log.notes)
     year_ns = 8766 * hour_ns
-    line = r"b.mcap ends 2.0 years before .*a.mcap begins: they are not parts of one log; run each by itself"
+    line = r"b.mcap ends 2.0 years before .*a.mcap begins, so they are not parts of one log; run each separately"
     with pytest.raises(InputError, match=line):
         after(2 * year_ns)
     assert line[:6] in describe([tmp_path], LogConfig())["problem"]
@@ -194,7 +194,7 @@ def test_stamps_that_step_back_or_repeat_are_told(tmp_path):
         assert [scan.stamp_ns - STAMP_NS for scan in log.scans()] == stamps
         assert len(log.notes) == 3 and log.notes[0].startswith("no point times")
         assert any("1 step back in the header stamps of /scan" in note for note in log.notes)
-        assert any("1 of 6 scans of /scan with the header stamp of the one before" in note for note in log.notes)
+        assert any("1 of 6 scans of /scan with the header stamp of the previous one" in note for note in log.notes)
 
 
 def test_a_chunk_that_says_nothing_of_its_times_loses_no_scan(tmp_path):
@@ -272,13 +272,13 @@ MAST = ("mast", 1.0, 0.0, np.pi / 2, 0.0)
         ([("map", "camera", 1.0, 0.0, 0.0, 0.0)], "base_link", (0.0, 0.0, 0.0), "", "estimated from the wheels"),
         (
             [("imu_link", *MAST), LASER], None, (1.0, 0.5, np.pi / 2), "imu_link",
-            "the log has no transform from base_link to laser: imu_link is taken as the base",
+            "the log has no transform from base_link to laser: imu_link is used as the base",
         ),
         (
             [("rig", "chassis", 5.0, 0.0, 0.0, 0.0), ("chassis", "laser", 0.5, 0.0, 0.0, 0.0)], "chassis",
             (0.5, 0.0, 0.0), "chassis", "",
         ),
-        ([("map", "mast", 9.0, 0.0, 0.0, 0.0), LASER], None, (0.5, 0.0, 0.0), "mast", "mast is taken as the base"),
+        ([("map", "mast", 9.0, 0.0, 0.0, 0.0), LASER], None, (0.5, 0.0, 0.0), "mast", "mast is used as the base"),
     ],
     ids=["chained", "no chain", "root of the tree", "frame of the wheels", "below the world"],
 )  # fmt: skip
@@ -348,9 +348,9 @@ def test_many_copies_of_scans_are_a_warning_and_a_few_are_a_note(tmp_path, copie
     log, scans = read(write(tmp_path / "a.mcap", said))
     assert len(scans) == 20
     if copies > 1:
-        assert "6 of 20 scans of /scan are the one before once more" in log.damage[0]
+        assert "6 of 20 scans of /scan are bitwise copies of the previous one" in log.damage[0]
     else:
-        assert not log.damage and any("1 of 20 scans of /scan logged twice" in note for note in log.notes)
+        assert not log.damage and any("1 of 20 scans of /scan are bitwise copies" in note for note in log.notes)
 
 
 # clouds of planar scanners
@@ -372,7 +372,7 @@ def test_scans_whose_points_are_far_from_the_stamp_are_read_without_times_and_th
     log, scans = read(path, point_times="s", max_bad_scans_percent=0.0)
     assert [len(scan.times_s) for scan in scans] == [0, 0, 0]
     assert any("times of 3 of 3 scans of /points contradict the period" in note for note in log.notes)
-    assert any("of another unit? scanchain doctor names the flag" in line for line in log.damage)
+    assert any("is the unit wrong? scanchain doctor names the flag" in line for line in log.damage)
     assert all(len(scan.times_s) == 9 for scan in read(path, point_times="ns")[1])
 
 
@@ -512,7 +512,7 @@ def test_the_mounting_of_a_real_lidar_on_its_imu_is_read():
     files = [shared_data("3d/kitti_0005_first60.mcap"), shared_data("3d/kitti_0005_first60_imu_gnss.mcap")]
     log = open_log(files)
     np.testing.assert_allclose(log.T_base_lidar[:3, 3], [0.811, -0.307, 0.802], atol=1e-3)
-    assert log.mounting.base == "imu_link" and "imu_link is taken as the base" in log.notes[0]
+    assert log.mounting.base == "imu_link" and "imu_link is used as the base" in log.notes[0]
 
 
 def test_kitti_ground_truth_is_that_of_the_published_file():

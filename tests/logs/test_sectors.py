@@ -63,7 +63,7 @@ def test_sectors_make_the_sweeps_that_they_were_cut_from(tmp_path, how, of):
     assert log.scan_count == len(expected)
     assert_same(scans, expected)
     topic, count = log.topic, round(360 / how.width_deg)
-    holds = f"{topic}: each message holds {how.width_deg:g}° of a revolution"
+    holds = f"{topic}: each message covers {how.width_deg:g}° of a revolution"
     assert f"{holds}: {count} messages are assembled to one sweep" in log.notes
     assert not any("azimuth" in note for note in log.notes)
 
@@ -161,7 +161,7 @@ def test_parts_and_every_count_sweeps(tmp_path):
 
 def test_info_doctor_and_run_name_the_sectors_and_count_sweeps(call, tmp_path):
     path = cut(whole(*SPATIAL), tmp_path / "cut.mcap", Cut(90.0))
-    line = "/points: each message holds 90° of a revolution: 4 messages are assembled to one sweep"
+    line = "/points: each message covers 90° of a revolution: 4 messages are assembled to one sweep"
     code, output, _ = call("info", path)
     assert code == 0
     says(output, line, "120 messages", "/points: 3D, 30 scans")

@@ -123,8 +123,8 @@ def _doctor_text(found: Diagnosis) -> str:
     lines = [f"{', '.join(found.files)} {found.topic} ({found.dimension}D)"]
     for finding in found.findings:
         lines.append(f"{finding.severity:<8} {finding.check:<12} {finding.found}")
-        remedy = finding.remedy and f"→ {finding.remedy}"
-        lines += [f"{'':<21} {line}" for line in (finding.effect, remedy) if line]
+        fix = finding.fix and f"→ {finding.fix}"
+        lines += [f"{'':<21} {line}" for line in (finding.effect, fix) if line]
     return "\n".join([*lines, *(f"{'note':<21} {note}" for note in found.notes)])
 
 

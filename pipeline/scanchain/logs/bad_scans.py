@@ -1,4 +1,4 @@
-"""Unusable scans of a log: their defects, the number allowed, and the counts reported."""
+"""Unusable scans of a log: their defects, the number allowed, and the warnings about them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.publishers import Publisher
 
-_MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
-_FEWEST_COPIED = 10  # least number of points for a scan to count as a copy
-_COPIES_SHARE = 0.01  # share of copies among the scans above which they are a warning
-_MOST_RATE = 50.0  # ratio of two clocks' rates above which their units differ (by 1000 or more, apart from gaps)
-_AGAIN = 0.1  # distance from the first stamp, as a share of the jump, below which the stamps have restarted
-_SAMPLE = 64  # points tested first: every 64th for the range (usually one is in it), the first 64 for a copy
+_MOST_REPEATED = 0.5  # share of repeated stamps above which they are a warning, not a note
+_FEWEST_COPIED = 10  # smallest number of points of a copy; fewer can be equal by chance
+_COPIES_SHARE = 0.01  # share of copies among the scans above which they are a warning, not a note
+_MOST_RATE = 50.0  # ratio of two clock rates above which their units differ: by 1000, less gaps
+_AGAIN = 0.1  # distance from the first stamp, as a share of the jump, below which the recording restarted
+_SAMPLE = 64  # points compared first; in most scans they decide, which saves time
 
 
 @dataclass(slots=True)
@@ -61,7 +61,7 @@ def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
     if not isinstance(returns, Returns):
         return f"is malformed: {returns}"
     if message.log_time_ns >= 1 << 63:
-        return f"has the log time {message.log_time_ns} ns, which no clock shows"
+        return f"has the log time {message.log_time_ns} ns, which is impossible"
     if not len(returns.points):
         return f"has no valid point ({returns.why})"
     outside = "" if preprocess is None else _none_retained(returns.points, preprocess)
@@ -85,7 +85,7 @@ def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
 
 
 class ScanCounts:
-    """Counts of scans left out, copied, with stamps out of order, and without wheels, for the report of a log."""
+    """Counts of scans left out, copied, with stamps out of order, or without wheel odometry."""
 
     def __init__(self, topic: str, odometry_topic: str) -> None:
         self.topic = topic
@@ -98,7 +98,7 @@ class ScanCounts:
         self.steps_ns = [(0, 0)]  # steps of header stamp and log time from scan to scan, without jumps
         self._last: Scan | None = None
 
-    def skip(self, complaint: str, expected: int, config: LogConfig) -> None:
+    def reject(self, complaint: str, expected: int, config: LogConfig) -> None:
         """Count a scan that is left out. Raises InputError if too many of the ``expected`` scans are left out."""
         self.scans += 1
         self.bad += 1
@@ -125,8 +125,8 @@ class ScanCounts:
         last = self._last.points
         return np.array_equal(points[:_SAMPLE], last[:_SAMPLE]) and np.array_equal(points, last)
 
-    def take(self, scan: Scan) -> None:
-        """Count a scan that is passed on."""
+    def add(self, scan: Scan) -> None:
+        """Count a scan that is used."""
         self.scans += 1
         self.without_wheels += scan.T_odom_base is None
         self.copies += scan.is_copy
@@ -148,11 +148,11 @@ class ScanCounts:
         """Jump of the stamps at a scan: its size, where it is, and its likely cause."""
         cause = "a clock that was set, or a playback that skipped a part"
         if abs(scan.stamp_ns - self.begin_ns) < _AGAIN * abs(last.stamp_ns - scan.stamp_ns):
-            cause = "a recording played in a loop, or a simulation that began again"
+            cause = "a recording played in a loop, or a simulation that restarted"
         elif scan.clock_jump_s < 0.0:
-            cause = "a clock that was set back, or a recording of before"
+            cause = "a clock that was set back, or an older recording"
         step, logged_s = _signed(scan.clock_jump_s), 1e-9 * (scan.log_time_ns - last.log_time_ns)
-        return f"scan {scan.index:,}: {step} while the log goes on by {logged_s:.2g} s): {cause}"
+        return f"scan {scan.index:,}: {step} while log times advance by {logged_s:.2g} s): {cause}"
 
     def _share(self, count: int) -> str:
         return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
@@ -160,10 +160,10 @@ class ScanCounts:
     def losses(self) -> list[str]:
         """Warnings about scans left out or copied, and about header stamps if most repeat the previous one."""
         tallies = self.publishers.values()
-        used = "".join(f"; used is {each.text}" for each in tallies if not each.publisher.note)
+        used = "".join(f"; the one used is {each.text}" for each in tallies if not each.publisher.note)
         total = counted(sum(each.messages for each in tallies), "message")
         lines = [
-            f"{each.messages:,} of {total} of {self.topic} left out, of another publisher: {each.text}{used}"
+            f"{each.messages:,} of {total} of {self.topic} left out, from another publisher: {each.text}{used}"
             for each in tallies
             if not each.is_used
         ]
@@ -172,13 +172,13 @@ class ScanCounts:
             lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
         if self.repeated > _MOST_REPEATED * self.scans:
             lines.append(
-                f"{self._share(self.repeated)} have the header stamp of the one before: the times in the results "
-                "do not tell scans apart; record with stamps"
+                f"{self._share(self.repeated)} have the header stamp of the previous one: times in the results do "
+                "not distinguish scans; record with stamps"
             )
         if self.copies > max(MOST_COPIES, _COPIES_SHARE * self.scans):
             lines.append(
-                f"{self._share(self.copies)} are the one before once more, to the last bit: where the driver was "
-                "stuck, the poses stand still though the lidar may have moved (scanchain doctor)"
+                f"{self._share(self.copies)} are bitwise copies of the previous one: while the driver is "
+                "stuck, poses do not change though the lidar may move (scanchain doctor)"
             )
         return lines
 
@@ -189,7 +189,7 @@ class ScanCounts:
             lines.append(
                 f"{counted(len(self.jumps_s), 'jump')} of the header stamps of {self.topic}, by up to "
                 f"{_signed(max(self.jumps_s, key=abs))} (the first at {self.first_jump}; "
-                "each begins a new segment, as nothing says how far the lidar moved meanwhile"
+                "each begins a new segment, as the motion in between is unknown"
             )
         steps_s = 1e-9 * np.array(self.steps_ns, np.float64)
         (all_s, all_logged_s), (usual_s, usual_logged_s) = steps_s.sum(axis=0), np.median(steps_s, axis=0)
@@ -198,11 +198,11 @@ class ScanCounts:
         if 0.0 < _MOST_RATE * usual_s < usual_logged_s:  # the inverse only means logging in bursts
             advance = f"{usual_s:.3g} s from scan to scan, log times by {usual_logged_s:.3g} s (medians)"
         if advance:
-            lines.append(f"header stamps of {self.topic} advance by {advance}: is one of them in another unit?")
+            lines.append(f"header stamps of {self.topic} advance by {advance}: is the unit of one of them wrong?")
         return lines
 
     def recovered(self, expected: int) -> str:
-        """Number of scans read from a damaged log, with the expected number if fewer were found, as text."""
+        """Number of scans read from a damaged log, and the expected number if that is larger, as text."""
         read = self.scans - self.bad
         scans = counted(read, "scan") if self.scans >= expected else f"{read:,} of {counted(expected, 'scan')}"
         return f"{scans} of {self.topic} {'was' if read == 1 else 'were'} recovered"
@@ -211,15 +211,15 @@ class ScanCounts:
         """Notes on a small number of copies, on stamps out of order and on missing wheel odometry."""
         lines = []
         if 0 < self.copies <= max(MOST_COPIES, _COPIES_SHARE * self.scans):
-            lines.append(
-                f"{self._share(self.copies)} logged twice, to the last bit: a copy has the first one's pose"
-            )
+            lines.append(f"{self._share(self.copies)} are bitwise copies of the previous one and get its pose")
         if self.backwards:
             steps = counted(self.backwards, "step")
             most = f"by up to {1e-9 * self.farthest_back_ns:.2g} s"
-            lines.append(f"{steps} back in the header stamps of {self.topic}, {most}; the log's order is kept")
+            lines.append(
+                f"{steps} back in the header stamps of {self.topic}, {most}; the order of the log is used"
+            )
         if 0 < self.repeated <= _MOST_REPEATED * self.scans:
-            lines.append(f"{self._share(self.repeated)} with the header stamp of the one before")
+            lines.append(f"{self._share(self.repeated)} with the header stamp of the previous one")
         if self.odometry_topic and self.without_wheels:
             lines.append(
                 f"{self._share(self.without_wheels)} without a reading of {self.odometry_topic} near the stamp; "

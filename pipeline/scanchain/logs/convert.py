@@ -65,8 +65,8 @@ def convert(
     counts = {name: 0 for name in channels if name not in others}
     for topic in counts:
         if config.every > 1 and is_lidar(channels[topic]) and Log(indexes, replace(config, topic=topic)).sectors:
-            parts = f"the messages of {topic} are sectors of revolutions, in which --every would leave holes"
-            raise InputError(f"{name_of(indexes)}: {parts}; give it to run instead, which counts sweeps")
+            parts = f"the messages of {topic} are sectors of revolutions, in which --every would cause dropouts"
+            raise InputError(f"{name_of(indexes)}: {parts}; run counts sweeps instead")
     span = stream.chosen_span(stream.whole_span(indexes), config)
     moving = [topic for topic in counts if not topic.endswith(_FIXED)]
     if span != stream.EVERYTHING and not any(stream.count_messages(indexes, topic, span) for topic in moving):
@@ -82,8 +82,7 @@ def convert(
                 progress(sum(counts.values()), total)
         if not sum(counts.values()):
             raise InputError(
-                f"{name_of(indexes)}: holds no message that could be read: "
-                f"{'; '.join(grouped(damage)) or 'it is empty'}"
+                f"{name_of(indexes)}: contains no readable message: {'; '.join(grouped(damage)) or 'it is empty'}"
             )
     notes = (*(line for index in indexes for line in index.notes), *stream.notes_on(indexes, config))
     return Converted(destination, counts, notes, tuple(grouped(damage)))

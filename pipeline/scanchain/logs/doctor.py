@@ -25,14 +25,14 @@ from scanchain.logs.messages.readers import is_scan
 from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
-_GAP_PERIODS = 2.5
-_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
+_GAP_PERIODS = 2.5  # longest time between scans, in periods, that is not a gap
+_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0  # longest gap over which the motion is predicted reliably
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # scan duration over period outside which a time unit is implausible
 _FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
 _LEAST_STEP_M = 1e-3  # distance between two wheel readings above which the robot moves
 _MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
 _STUCK_SHARE = 0.01  # share of beams at the farthest range above which it is reported
-_FEW_POINTS = 50
+_FEW_POINTS = 50  # number of returns below which matches are weak
 _SAME_M = 1e-4  # largest difference of ranges that count as equal: rounding of float32
 
 
@@ -49,22 +49,22 @@ class Severity(StrEnum):
 class Finding:
     """Result of one check.
 
-    check : what was checked, in one or two words
-    found : what was measured, with units
-    effect : effect on the result, empty if there is none
-    remedy : flags of ``scanchain run`` that help, exactly as typed; empty if none does
+    check : subject of the check, in one or two words
+    found : measurement, with units
+    effect : effect on the result; empty if there is none
+    fix : flags of ``scanchain run`` that fix it, exactly as typed; empty if none does
     """
 
     check: str
     severity: Severity
     found: str
     effect: str = ""
-    remedy: str = ""
+    fix: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Findings about a log, the most severe first; ``notes`` : what was assumed when opening it."""
+    """Findings about a log, the most severe first; ``notes`` : assumptions made when opening it."""
 
     files: tuple[str, ...]
     topic: str
@@ -89,7 +89,7 @@ def examine(
     notes = tuple(log.notes)
     seen = Survey(log)
     for scan in log.scans():
-        seen.take(scan)
+        seen.add(scan)
         progress(len(seen.log_times_ns), log.scan_count)
     config = config_of(log.dimension)
     found = list(_check(seen, config, most_bad_scans(seen.messages, log_config)))
@@ -104,27 +104,24 @@ def examine(
 class Facts(NamedTuple):
     """Statistics of the returns of one scan."""
 
-    kept: int  # number of valid returns
-    dropped: int  # number of invalid returns
+    valid: int  # number of valid returns
+    invalid: int
     farthest_m: float
     at_farthest: int  # number of returns at that range
     ranges_m: NDArray[np.float32]  # (101,) percentiles
-    time_span_s: float  # of the per-point times, NaN where there are none
-    is_copy: bool  # the points are bitwise identical to those of the previous scan
+    time_span_s: float  # of the per-point times, NaN if there are none
+    is_copy: bool  # bitwise copy of the previous scan
 
 
 class Survey:
     """Statistics of the readable scans of a log, their times, and stamped wheel odometry positions (d,)."""
 
     def __init__(self, log: Log) -> None:
-        self.log = log
-        self.scans: list[Facts] = []
-        self.log_times_ns: list[int] = []
-        self.stamps_ns: list[int] = []
+        self.log, self.noise = log, RangeNoise()
+        self.scans, self.log_times_ns, self.stamps_ns = list[Facts](), list[int](), list[int]()
         self.wheels: list[tuple[int, NDArray[np.float64]]] = []
-        self.noise = RangeNoise()
 
-    def take(self, scan: Scan) -> None:
+    def add(self, scan: Scan) -> None:
         """Add the next scan."""
         self.log_times_ns.append(scan.log_time_ns)
         self.stamps_ns.append(scan.stamp_ns)
@@ -132,17 +129,11 @@ class Survey:
         if scan.T_odom_base is not None:
             self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
         ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
-        self.scans.append(
-            Facts(
-                kept=len(ranges_m),
-                dropped=scan.dropped,
-                farthest_m=round(float(ranges_m[-1]), 4),
-                at_farthest=int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M)),
-                ranges_m=ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)],
-                time_span_s=float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan,
-                is_copy=scan.is_copy,
-            )
-        )
+        at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M))
+        percentiles_m = ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)]
+        span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan
+        counts, farthest_m = (len(ranges_m), scan.dropped), round(float(ranges_m[-1]), 4)
+        self.scans.append(Facts(*counts, farthest_m, at_farthest, percentiles_m, span_s, scan.is_copy))
 
     @property
     def messages(self) -> int:
@@ -158,9 +149,9 @@ class Survey:
                 return float(np.median(steps_s))
         return 0.0
 
-    def into_log_s(self, place: int) -> float:
-        """Seconds from the log's first message to scan number ``place``, as in ``--start`` and ``--end``."""
-        return (self.log_times_ns[place] - whole_span(self.log.indexes).begin_ns) * 1e-9
+    def log_time_s(self, index: int) -> float:
+        """Log time of a scan since the first message, as for ``--start`` and ``--end``."""
+        return (self.log_times_ns[index] - whole_span(self.log.indexes).begin_ns) * 1e-9
 
 
 def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
@@ -184,14 +175,14 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {periods}")
     longest = int(gaps[np.argmax(steps_s[gaps])])
-    longest_s, at_s = steps_s[longest], seen.into_log_s(longest)
+    longest_s, at_s = steps_s[longest], seen.log_time_s(longest)
     found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, {at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
     if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
         return Finding("gaps", Severity.NOTE, found, effect)
     effect += (
-        "; after a long one the match may settle elsewhere: run what comes before it, as below, and the rest, "
-        f"--start {math.floor(10.0 * (at_s + longest_s)) / 10.0:g}, apart"
+        "; after a long gap a match may converge to a wrong pose: run the part before, as below, and the rest, "
+        f"--start {math.floor(10.0 * (at_s + longest_s)) / 10.0:g}, separately"
     )
     return Finding("gaps", Severity.WARNING, found, effect, f"--end {math.ceil(10.0 * at_s) / 10.0:g}")
 
@@ -199,14 +190,16 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
 def _stamps(seen: Survey) -> Finding:
     """Finding on header stamps that go backward, jump, or advance at a different rate than log times."""
     if seen.log.jumps:
-        effect = "speeds count by header stamps; gaps, --start and --end by log times: correct what is wrong"
+        effect = "speeds are by header stamps; gaps, --start and --end by log times: correct the wrong ones"
         if "jump" in seen.log.jumps[0]:
-            effect = "the motion over a jump is unknown: a loop closure may join the segments; else run them apart"
+            effect = (
+                "the motion over a jump is unknown: a loop closure may join the segments; else run them separately"
+            )
         return Finding("stamps", Severity.WARNING, "; ".join(seen.log.jumps), effect)
     back_s = -1e-9 * np.diff(seen.stamps_ns)
     count = int(np.count_nonzero(back_s > 0.0))
     if not count:
-        return Finding("stamps", Severity.OK, "none runs back")
+        return Finding("stamps", Severity.OK, "none steps back")
     found = f"{counted(count, 'step')} back, by up to {back_s.max():.2g} s"
     return Finding("stamps", Severity.NOTE, found, "they jitter: scans are processed in the order of the log")
 
@@ -221,14 +214,12 @@ def _wheels(seen: Survey) -> Finding:
     without = "--odometry.prior constant-velocity"
     if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
-        effect = "no vehicle does: millimeters, or jumps? Scans are predicted where the robot never was"
+        effect = "no vehicle is as fast: millimeters, or jumps? Poses are predicted far from the robot"
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
     if missed:
         return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
     if log.stated_mounting is None:
-        effect = (
-            "where the log hardly turns, its place is not observable and taken for the robot's: record /tf_static"
-        )
+        effect = "where the robot hardly turns, the mounting is not observable and assumed zero: record /tf_static"
         return Finding("wheels", Severity.NOTE, f"{found}; {log.mounting.note}", effect)
     return Finding("wheels", Severity.OK, found)
 
@@ -262,7 +253,7 @@ def _point_times(seen: Survey) -> Finding:
         effect = f"{counted(untimed, 'scan')} without: {distorted}" if untimed else "the rest is used"
         return Finding("point times", grade, "; ".join([found, *faults]), effect if faults else "")
     found = "; ".join([f"{found}, {part:.2g} of the period", *faults])
-    effect = "if that is the wrong unit, deskewing distorts every scan"
+    effect = "if the unit is wrong, deskewing distorts every scan"
     return Finding("point times", Severity.WARNING, found, effect, _other_unit(times.assumed, part))
 
 
@@ -271,11 +262,11 @@ def _other_unit(assumed: str, part: float) -> str:
 
     part : scan duration over period in the assumed unit
     """
-    taken = next((unit for unit in UNITS_S if f"taken as {unit} " in assumed), "")
-    if not taken:
+    current = next((unit for unit in UNITS_S if f"taken as {unit} " in assumed), "")
+    if not current:
         return ""
     for unit, unit_s in UNITS_S.items():
-        if unit != taken and _PART_OF_SCAN < part * unit_s / UNITS_S[taken] < _MORE_THAN_SCAN:
+        if unit != current and _PART_OF_SCAN < part * unit_s / UNITS_S[current] < _MORE_THAN_SCAN:
             return f"--log.point_times {unit}"
     return "--log.point_times none" if part > _MORE_THAN_SCAN else ""
 
@@ -290,23 +281,22 @@ def _damage(seen: Survey, preprocess: PreprocessConfig, most_bad: float) -> Find
     if not lines:
         return Finding("damage", Severity.OK, f"{counted(len(seen.scans), 'scan')}, all readable and with points")
     if bad > most_bad:
-        effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
+        effect = "a run stops: there are more bad scans than log.max_bad_scans_percent allows"
         percent = math.ceil(100 * bad / seen.messages)
-        remedy = f"--log.max_bad_scans_percent {percent}" if bad < seen.messages else ""
-        return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
-    effect = "what was damaged is left out, the rest is used"
+        fix = f"--log.max_bad_scans_percent {percent}" if bad < seen.messages else ""
+        return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, fix)
+    effect = "damaged parts are left out, the rest is used"
     return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
 
 
 def _returns(seen: Survey) -> Finding:
-    kept, dropped = np.array([(scan.kept, scan.dropped) for scan in seen.scans]).T
-    lost = float(dropped.sum() / max((kept + dropped).sum(), 1))
-    found = (
-        f"{100 * lost:.2g} % of the beams without a valid return, {int(np.median(kept)):,} valid a scan (median)"
-    )
-    poor = kept < _FEW_POINTS
+    valid, invalid = np.array([(scan.valid, scan.invalid) for scan in seen.scans]).T
+    lost = float(invalid.sum() / max((valid + invalid).sum(), 1))
+    usual = f"{int(np.median(valid)):,} valid per scan (median)"
+    found = f"{100 * lost:.2g} % of the beams without a valid return, {usual}"
+    poor = valid < _FEW_POINTS
     if few := int(np.count_nonzero(poor)):
-        effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak there, or lost"
+        effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak or lost there"
         return Finding("returns", Severity.WARNING, found, effect, _without_ends(seen, poor))
     return Finding("returns", Severity.OK, found)
 
@@ -316,7 +306,7 @@ def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
     good = np.flatnonzero(~poor)
     if not len(good) or poor[good[0] : good[-1] + 1].any():
         return ""
-    start_s, end_s = (seen.into_log_s(place) for place in (good[0], good[-1]))
+    start_s, end_s = (seen.log_time_s(place) for place in (good[0], good[-1]))
     flags = [f"--start {math.floor(1e3 * start_s) / 1e3:g}"] if poor[0] else []
     return " ".join([*flags, *([f"--end {math.ceil(1e3 * end_s) / 1e3:g}"] if poor[-1] else [])])
 
@@ -326,20 +316,20 @@ def _noise(noise: RangeNoise, assumed_m: float) -> Finding:
     found = f"standard deviation {noise.text}"
     if noise.sigma_m <= assumed_m:
         return Finding("noise", Severity.OK, found)
-    effect = f"above matching.sensor_noise_m ({assumed_m:g}): a run takes what is measured, and larger voxels"
+    effect = f"above matching.sensor_noise_m ({assumed_m:g}): a run uses the measured noise, and larger voxels"
     return Finding("noise", Severity.NOTE, found, effect)
 
 
 def _no_return(seen: Survey) -> Finding:
-    """Finding on many beams at the same farthest range, as of scanners that report a number for no return."""
+    """Finding on many beams at the same farthest range, as of scanners that report one for no return."""
     values = Counter(scan.farthest_m for scan in seen.scans)
     farthest_m = max(values)
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
-    share = stuck / max(sum(scan.kept + scan.dropped for scan in seen.scans), 1)
+    share = stuck / max(sum(scan.valid + scan.invalid for scan in seen.scans), 1)
     if share < _STUCK_SHARE:
-        return Finding("no return", Severity.OK, "no range is so frequent that it must mean no return")
-    found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest there is"
-    effect = "if it stands for no return, it is taken for a wall that moves along"
+        return Finding("no return", Severity.OK, "no range is so frequent that it would indicate no return")
+    found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest range"
+    effect = "if it indicates no return, it is matched like a wall that moves along"
     below_m = math.floor(1e3 * farthest_m - 0.5) / 1e3  # strictly below the range, despite rounding
     return Finding("no return", Severity.WARNING, found, effect, f"--log.max_range_m {below_m:g}")
 
@@ -354,13 +344,13 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
         effect = f"{100 * unused:.3g} % lie beyond {high_m:g} m and are not used"
         if low_m <= 1e-3 * float(np.median(ranges_m)) <= high_m < near_m:
             return Finding("ranges", Severity.PROBLEM, found, f"{effect}: millimeters? convert them to meters")
-        remedy = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
-        return Finding("ranges", Severity.NOTE, found, effect, remedy)
+        fix = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, fix)
     if near_m < low_m:
         unused = float(np.mean(ranges_m < low_m))
         effect = f"{100 * unused:.3g} % lie nearer than {low_m:g} m and are not used (right for the robot itself)"
-        remedy = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
-        return Finding("ranges", Severity.NOTE, found, effect, remedy)
+        fix = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, fix)
     return Finding("ranges", Severity.OK, found)
 
 
@@ -368,14 +358,14 @@ def _duplicates(seen: Survey) -> Finding:
     copies = [scan.is_copy for scan in seen.scans]
     same = sum(copies)
     if not same:
-        return Finding("duplicates", Severity.OK, "no scan is the one before once more")
+        return Finding("duplicates", Severity.OK, "no scan is a copy of the previous one")
     in_a_row = 1 + max(len(list(run)) for is_copy, run in groupby(copies) if is_copy)
-    found = f"{same} of {len(copies):,} scans are the one before once more, to the last bit"
+    found = f"{same} of {len(copies):,} scans are bitwise copies of the previous one"
     if in_a_row > MOST_COPIES:
         found += f", {in_a_row:,} of them in a row"
-        effect = "the driver was stuck, or a simulation without noise at rest: the trajectory stands still there"
+        effect = "the driver was stuck, or a simulation without noise stood still: the trajectory does, too"
         return Finding("duplicates", Severity.WARNING, found, effect)
-    effect = "a copy looks like a stop: the prediction at constant velocity stands still, then has to catch up"
+    effect = "a copy looks like a stop: the prediction at constant velocity is wrong there and after it"
     every = round(len(copies) / (len(copies) - same))
-    remedy = f"--every {every}" if every > 1 else ""
-    return Finding("duplicates", Severity.WARNING, found, effect, remedy)
+    fix = f"--every {every}" if every > 1 else ""
+    return Finding("duplicates", Severity.WARNING, found, effect, fix)

@@ -17,12 +17,12 @@ from scanchain.errors import InputError, MissingExtraError, spelled
 from scanchain.files import Address, Source
 
 T = TypeVar("T")
-_ATTEMPTS = 4
+_ATTEMPTS = 4  # number of requests before an error that may be transient is final
 _PAUSE_S = 0.5  # pause after the first failure; twice as long after each further one
 _CONNECT_S, _SILENCE_S = 10.0, 30.0  # timeouts for connecting, and while waiting for data
 _ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
 
-_BLOCK_BYTES = 8_000_000
+_BLOCK_BYTES = 8_000_000  # size of the requests of a download
 
 
 class RemoteFile:
@@ -66,7 +66,7 @@ class RemoteFile:
         def ask() -> bytes:
             data: bytes = self._system.cat_file(self._path, start=offset, end=offset + size)
             if len(data) != size:
-                raise ConnectionError(f"{len(data)} bytes came instead of {size}")
+                raise ConnectionError(f"{len(data)} bytes received instead of {size}")
             return data
 
         return _patient(ask, f"{self.address}: byte {offset}") if size else b""
@@ -140,7 +140,9 @@ def fetch_whole(file: RemoteFile) -> Path:
             for offset in range(0, file.size, _BLOCK_BYTES):
                 written.write(file.read(offset, min(_BLOCK_BYTES, file.size - offset)))
     except OSError as error:
-        raise InputError(f"{copy}: {file.address} cannot be kept there ({error.strerror}); set TMPDIR") from error
+        raise InputError(
+            f"{copy}: {file.address} cannot be stored there ({error.strerror}); set TMPDIR"
+        ) from error
     return copy
 
 

@@ -21,9 +21,10 @@ from scanchain.files import Source
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none.
+    """A channel of messages; its texts are made printable.
 
-    ``definition`` defines the type, in the language ``schema_encoding``; the other texts are made printable.
+    key : number of the file and id of the channel in it, unique over all files of a log
+    schema : id of the schema, 0 if there is none; ``definition`` is its text in the language ``schema_encoding``
     """
 
     key: tuple[int, int]
@@ -40,7 +41,7 @@ class Channel:
 
 
 class Message(NamedTuple):
-    """One message: its channel, log time, and bytes; ``defect`` says why there are none."""
+    """A serialized message; ``defect`` is the reason if it cannot be read."""
 
     channel: Channel
     log_time_ns: int
@@ -49,7 +50,7 @@ class Message(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """A decoded message, or the decoder's error, a MalformedMessageError."""
+    """A decoded message; ``value`` is a MalformedMessageError if it could not be decoded."""
 
     channel: Channel
     log_time_ns: int
@@ -57,7 +58,7 @@ class Decoded(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """The messages of a block in the order of the file; ``damage`` describes what is missing behind them."""
+    """Messages of a block in the order of the file, and the damage after which others are missing, as text."""
 
     messages: list[Message]
     damage: str
@@ -65,13 +66,13 @@ class Contents(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A run of records: a chunk, or messages outside of any chunk.
+    """Consecutive records of a file: a chunk, or messages outside of chunks.
 
-    file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
-    compression, uncompressed_size : as the chunk states
-    start_ns, end_ns : log time of the first and last message
-    counts : messages by channel id; empty where the file does not state them
-    head : number of bytes of the chunk's record before them; 0 for messages outside of any chunk
+    file, offset, size : number of the file, and range of bytes in it; ``is_cut`` if the file ends within the range
+    compression, uncompressed_size : as stated by the chunk
+    start_ns, end_ns : log times of the first and last message
+    counts : number of messages by channel id; empty if the file does not state them
+    head : number of bytes of the chunk's record before the range; 0 for messages outside of chunks
     """
 
     file: int
@@ -87,7 +88,7 @@ class Block:
 
     @property
     def may_be_empty(self) -> bool:
-        """True if its times are those that writers give a chunk without any message."""
+        """True if its times are those that writers state for a chunk without messages."""
         return (self.start_ns == self.end_ns == 0 and not self.counts) or self.start_ns > self.end_ns
 
 
@@ -131,18 +132,18 @@ class FileIndex:
         return {number for number, channel in self.channels.items() if channel.topic in topics}
 
     def indexed_counts(self) -> Counter[int]:
-        """Messages by channel id, as the blocks state them."""
+        """Number of messages by channel id, as stated by the blocks."""
         counts = Counter[int]()
         for block in self.blocks:
             counts.update(block.counts)
         return counts
 
     def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
-        """True if a block can have messages of the channels."""
+        """True if a block may contain messages of the channels."""
         return not self.is_consistent or not block.counts or not channels.isdisjoint(block.counts)
 
-    def note_damage(self, line: str) -> None:
-        """Note a line once, however often the damage is met."""
+    def add_damage(self, line: str) -> None:
+        """Add a line on damage unless it is there already."""
         if line not in self.damage:
             self.damage.append(line)
 
@@ -152,25 +153,34 @@ class FileIndex:
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
 
+def most_decompressed(size: int) -> int:
+    """Largest accepted decompressed size of a chunk or message of ``size`` bytes; more indicates damage."""
+    return min(max(1 << 25, 20 * size), 1 << 30)
+
+
+def most_decompressed_file(size: int) -> int:
+    """Largest accepted decompressed size of a file of ``size`` bytes; more indicates another kind of file."""
+    return (1 << 25) + 200 * size
+
+
 class DamagedBlockError(Exception):
-    """A block whose contents cannot be trusted; the message says which and why."""
+    """A block that cannot be read reliably; the text names it and the reason."""
 
 
 def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> Contents:
-    """The messages of a block, of all channels or of those wanted; channels found there join the index.
+    """Contents of a block, of the wanted channels or of all; channels defined in it are added to the index.
 
-    Raises DamagedBlockError where a whole block does not unpack to what its header says.
+    Raises DamagedBlockError if a complete block does not decompress to what its header states.
     """
-    contents = index.contents(block, wanted)
-    return contents._replace(messages=[
-        message._replace(log_time_ns=message.log_time_ns or index.begin_ns)
-        for message in contents.messages
-        if wanted is None or message.channel.key[1] in wanted
-    ])  # fmt: skip
+    messages, damage = index.contents(block, wanted)
+    messages = [each for each in messages if wanted is None or each.channel.key[1] in wanted]
+    if index.begin_ns:
+        messages = [each._replace(log_time_ns=each.log_time_ns or index.begin_ns) for each in messages]
+    return Contents(messages, damage)
 
 
 def unpack(index: FileIndex, block: Block, stated_crc: Callable[[memoryview], int] = lambda _: 0) -> memoryview:
-    """Decompressed bytes of a block; of one that is cut off those that remain, unchecked.
+    """Decompressed bytes of a block; of a truncated one those that remain, unchecked.
 
     stated_crc : CRC-32 stated by the head of a chunk's record, 0 if there is none
     Raises DamagedBlockError.
@@ -182,10 +192,12 @@ def unpack(index: FileIndex, block: Block, stated_crc: Callable[[memoryview], in
     except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError, ValueError) as error:
         if block.is_cut:
             return memoryview(b"")
-        raise DamagedBlockError(f"{name_of_block(index, block)}: does not unpack ({one_line(error)})") from error
+        raise DamagedBlockError(
+            f"{name_of_block(index, block)}: cannot be decompressed ({one_line(error)})"
+        ) from error
     if not block.is_cut and len(payload) != size:
         raise DamagedBlockError(
-            f"{name_of_block(index, block)}: unpacks to {len(payload)} bytes instead of {size}"
+            f"{name_of_block(index, block)}: decompresses to {len(payload)} bytes instead of {size}"
         )
     if not block.is_cut and crc and zlib.crc32(payload) != crc:
         raise DamagedBlockError(f"{name_of_block(index, block)}: its CRC is wrong")
@@ -193,14 +205,14 @@ def unpack(index: FileIndex, block: Block, stated_crc: Callable[[memoryview], in
 
 
 def release(index: FileIndex, block: Block) -> None:
-    """Release a block's bytes of the file, so that memory does not grow with what has been read."""
+    """Release the memory that maps a block, so that memory does not grow with the part that has been read."""
     if isinstance(index.data, mmap.mmap) and hasattr(index.data, "madvise"):
         begin = block.offset - block.offset % mmap.PAGESIZE
         index.data.madvise(mmap.MADV_DONTNEED, begin, block.offset + block.size - begin)
 
 
 def _decompressed(stored: memoryview, compression: str, size: int, *, is_cut: bool) -> bytes | memoryview:
-    """At most so many bytes; of what is cut off as many as there are."""
+    """At most ``size`` decompressed bytes; of a truncated block those that remain."""
     if not size or compression == "":
         return stored if size else b""
     if compression == "zstd" and is_cut:
@@ -208,28 +220,28 @@ def _decompressed(stored: memoryview, compression: str, size: int, *, is_cut: bo
             return reader.read(size)
     if compression == "zstd":
         if zstandard.frame_content_size(stored) not in (-1, size):
-            raise ValueError("it lies about the size it unpacks to")
+            raise ValueError("it states another decompressed size")
         return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
     if compression == "lz4":
         return lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
     if compression == "bz2":
         return bz2.BZ2Decompressor().decompress(stored, max_length=size)
-    raise ValueError(f"compression {compression!r} is not known; none, lz4 and zstd are")
+    raise ValueError(f"compression {compression!r} is not supported; none, lz4 and zstd are")
 
 
 def name_of_block(index: FileIndex, block: Block) -> str:
     """Name of a block in messages about damage."""
-    return f"{index.path}: the {'chunk' if block.head else 'run of messages'} at byte {block.offset}"
+    return f"{index.path}: the {'chunk' if block.head else 'sequence of messages'} at byte {block.offset}"
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:
-    """Name of a log's files in errors: all of two, of more the first and the number of the others."""
+    """Names of a log's files for errors; of more than two the first and the number of the others."""
     paths = [str(index.path) for index in indexes]
     shown = f"{paths[0]} and {len(paths) - 1} more files" if len(paths) > 2 else " and ".join(paths)
     return f"{shown}, read as one log" if len(paths) > 1 else shown
 
 
 def damage_of(indexes: Sequence[FileIndex]) -> str:
-    """Damage of a log as the end of an error that it may explain; empty where there is none."""
+    """Damage of a log, to be appended to an error that it may explain; empty if there is none."""
     damage = [line for index in indexes for line in index.damage]
-    return f"; it is damaged in {counted(len(damage), 'place')}, the first: {damage[0]}" if damage else ""
+    return f"; it is damaged in {counted(len(damage), 'place')} (the first: {damage[0]})" if damage else ""

@@ -24,18 +24,18 @@ from scanchain.logs.bad_scans import ScanCounts, defect
 from scanchain.logs.index import Decoded, FileIndex, name_of
 from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
 from scanchain.logs.messages.point_times import UNTIMED, PointTimes
-from scanchain.logs.messages.poses import RecordedPoses, StampedPose
+from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
+from scanchain.logs.samples import NEAREST_NS, Recorded
 from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
-_HOLD_NS = 500_000_000  # longest log time that a scan waits for the next wheel reading
-_HOLD_SCANS = 32
+_HOLD_SCANS = 32  # largest number of scans that wait for samples after their stamp; limits memory
 
 
 def open_log(
@@ -71,20 +71,19 @@ def sources_of(sources: Source | str | Sequence[Source | str]) -> tuple[Source, 
 class Log:
     """An opened log; ``scans`` can be iterated any number of times.
 
-    paths : its files; name : these as errors name them
-    topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
-    mounting : mounting of the lidar on the robot; T_base_lidar : (d+1, d+1) its pose; stated_mounting : the same
-        pose, None if it is assumed
-    scan_count : number of scans to expect by the index, given start, end and every
-    duration_s : from the first message to the last
-    odometry_topic : topic of the wheel odometry, empty if there is none; wheels : the same as text, for /tf with
-        frames and rate
-    scans_with_wheels : number of scans read so far that have a wheel reading near their stamp
-    notes : what was chosen or assumed
-    bad_scans : number of scans left out, set once ``scans`` is exhausted or closed
-    times : findings on the per-point times; jumps : warnings about jumps or a wrong rate of the header stamps
-    distortion : motion distortion of scans without point times, as text, if it is not removed
-    distorted_share : share of the motion between scans by which they may be distorted, if nothing removes it
+    paths, name : its files, and their names for errors
+    topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for other clouds
+    mounting : of the lidar on the robot, with T_base_lidar (d+1, d+1); stated_mounting : None if it is assumed
+    scan_count : number of scans by the index, for the chosen part and ``every``
+    duration_s : time from the first to the last message
+    odometry_topic : topic of the wheel odometry, empty if there is none; wheels : with frames and rate, for /tf
+    notes : choices and assumptions
+    distortion : motion distortion of scans without point times, as text; empty if it is removed
+    distorted_share : share of the motion between scans that distorts them, if it is not removed
+
+    Set by reading, once ``scans`` is exhausted or closed:
+    bad_scans, scans_with_wheels : number of scans left out, and with a wheel reading near their stamp
+    times : reader of the point times; jumps : warnings about jumps or a wrong rate of the header stamps
     """
 
     _truth: Trajectory | None
@@ -151,7 +150,7 @@ class Log:
     def __getitem__(self, index: int) -> Scan:
         """The scan with this index, from 0; all before it are read too. Raises InputError if there is none."""
         number = checks.integer(
-            index, "index", "a scan's number, from 0; islice(log, first, last) for some", least=0
+            index, "index", "the number of a scan, from 0; islice(log, first, last) for some", least=0
         )
         with closing(self._apart().scans()) as scans:
             scan = next(islice(scans, number, None), None)
@@ -182,13 +181,13 @@ class Log:
         """
         self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
-        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self._lidar_on)
+        recorded = Recorded(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
         self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic, self.times)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
-            for message, T_odom_base, jumped_s in with_jumps(self._with_poses(counts, poses, assembler)):
+            for message, T_odom_base, jumped_s in with_jumps(self._with_samples(counts, recorded, assembler)):
                 count += 1
                 jump_s = jumped_s or jump_s
                 if (count - 1) % self.config.every:
@@ -196,7 +195,7 @@ class Log:
                 if unusable := defect(message, preprocess):
                     path = self.indexes[message.channel.key[0]].path
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
-                    counts.skip(complaint, self.scan_count, self.config)
+                    counts.reject(complaint, self.scan_count, self.config)
                     continue
                 returns: Returns = message.value
                 points, others = seen_together(returns, self.publishers, latest, is_mirrored=self.is_mirrored)
@@ -213,20 +212,20 @@ class Log:
                     clock_jump_s=jump_s,
                     others=others,
                 )
-                counts.take(scan)
+                counts.add(scan)
                 self.scans_with_wheels += T_odom_base is not None
                 yield scan
                 index, jump_s = index + 1, 0.0
                 requested_s = working_s()
-            self._truth = poses.ground_truth()
+            self._truth = recorded.ground_truth(self._lidar_on)
         finally:  # also if the caller stops early
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
-            self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
+            self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *recorded.losses()]
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
             is_said = any(note.startswith(UNTIMED.partition(":")[0]) for note in self._opening_notes)
             assumed = "" if is_said and self.times.assumed == UNTIMED else self.times.assumed
             self.notes += [*filter(None, [assumed]), *self.times.faults(self.topic)]
-            self.notes += counts.notes() + (assembler.notes() if assembler else []) + poses.notes()
+            self.notes += counts.notes() + (assembler.notes() if assembler else []) + recorded.notes()
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -286,10 +285,10 @@ class Log:
         """Poses of ``log.ground_truth_topic`` or None; read separately if ``scans`` is not exhausted."""
         topic = self.ground_truth_topic
         if self._truth is None and topic:
-            poses, decoders = RecordedPoses("", topic, self._lidar_on), {topic: self.pose_decoders[topic]}
+            recorded, decoders = Recorded("", topic), {topic: self.pose_decoders[topic]}
             for message in stream.decoded_messages(self.indexes, decoders, self.span, damage=[]):
-                poses.take(message)
-            self._truth = poses.ground_truth()
+                recorded.add(message)
+            self._truth = recorded.ground_truth(self._lidar_on)
         return self._truth
 
     def _lidar_on(self, frame: str) -> Pose:
@@ -299,30 +298,31 @@ class Log:
         T = np.eye(4) if T is None else T
         return in_plane(T) if self.dimension == 2 else T
 
-    def _with_poses(
-        self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None
+    def _with_samples(
+        self, counts: ScanCounts, recorded: Recorded, assembler: Assembler | None
     ) -> Iterator[tuple[Decoded, Pose | None]]:
-        """Scans with the wheel odometry pose at their stamp; each waits briefly for the next wheel reading."""
+        """Scans with the wheel odometry pose at their stamp; they are held back briefly for samples after them."""
         decoders = {self.topic: self.decoder(self.times), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
         messages = messages if assembler is None else assembler.sweeps(messages)
-        for message in chain(self.times.judged(messages, self.topic), [None]):
+        for message in chain(self.times.checked(messages, self.topic), [None]):
             if message is not None and message.channel.topic == self.topic:
                 value = message.value
                 if not isinstance(value, Returns) or counts.uses(self.publishers.of(value.frame), value):
                     waiting.append(message)
             elif message is not None:
-                poses.take(message)
+                recorded.add(message)
             while waiting and (
                 message is None
                 or len(waiting) > _HOLD_SCANS
-                or message.log_time_ns - waiting[0].log_time_ns > _HOLD_NS
+                or message.log_time_ns - waiting[0].log_time_ns > NEAREST_NS
                 or not isinstance(first := waiting[0].value, Returns)
-                or poses.covers(first.stamp_ns)
+                or recorded.covers(first.stamp_ns)
             ):
                 scan = waiting.popleft()
-                yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+                wheels = recorded.odometry.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+                yield scan, wheels and wheels.T_parent_child
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` records what is assumed about the point times."""

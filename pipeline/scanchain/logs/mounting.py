@@ -21,9 +21,9 @@ from scanchain.logs.topics import find_odometry, topics_of
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 # words in the names of world-fixed frames
 _WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}
-_TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # rotation and translation above which two transforms differ
-TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane above which its scans are no floor plan
-_TURNED_DEG = 0.5  # least rotation angle of a lidar on its robot that is reported
+_TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # largest difference of transforms that count as equal
+TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar above which its scans are not a floor plan
+_TURNED_DEG = 0.5  # smallest rotation of a lidar on its robot that is reported
 
 
 class Mounting(NamedTuple):
@@ -60,7 +60,7 @@ class Mounting(NamedTuple):
         if dimension == 2 and (tilted_rad := tilt_rad(self.T_base_lidar)) > TILTED_RAD:
             notes.append(
                 f"the plane of the scans is tilted by {np.degrees(tilted_rad):.0f} deg on {self.base_name} "
-                f"{self.source}: a floor plan takes a level one; correct the transforms, or choose another --topic"
+                f"{self.source}: a floor plan needs a level one; correct the transforms, or choose another --topic"
             )
         elif dimension == 2 and is_upside_down(self.T_base_lidar):
             notes.append(f"the lidar hangs upside down {self.source}: its scans are mirrored")
@@ -80,8 +80,8 @@ def find_wheels(
 ) -> Wheels | None:
     """Wheel odometry of a log: a topic or, without one, the transform from an odometry frame to the lidar's robot.
 
-    Not taken for odometry: map → odom of a SLAM system, a transform to the lidar's own frame and, unless it is
-    configured, a transform that never changes.
+    Not odometry: map → odom of a SLAM system, a transform to the lidar's own frame and, unless it is configured,
+    a transform that never changes.
     """
     topic, wanted = find_odometry(indexes, config, notes), config.odometry_topic
     if topic is None or not is_moving_transforms(topic):
@@ -101,7 +101,7 @@ def find_wheels(
     if wanted and len(found) != 1:
         raise InputError(
             f"{name_of(indexes)}: {wanted} has no transform from an odometry's frame to the lidar's robot, as "
-            f"odom → base_link, or several; it holds: {names}"
+            f"odom → base_link, or several; it contains: {names}"
         )
     if len(found) > 1:
         notes.append(f"several odometries on /tf ({names}), none is used")
@@ -109,7 +109,7 @@ def find_wheels(
         return None
     channel, poses = links[found[0]]
     if not wanted and not np.ptp([each.T_parent_child for each in poses], axis=0).any():
-        notes.append(f"{names} of {channel.topic} never changes: no odometry, not used")
+        notes.append(f"{names} of {channel.topic} never changes: not used as odometry")
         return None
     steps_ns = np.diff(np.unique([each.stamp_ns for each in poses]))
     rate_hz = 1e9 / float(np.median(steps_ns)) if len(steps_ns) else 0.0
@@ -136,11 +136,11 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
     root = _root([each for each in fixed if not _is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
-        note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
+        note = f"the log has no transform from {bases[0]} to {frame}: {root} is used as the base"
         notes = filter(None, [note, _disagreeing(fixed, rivals, root, frame)])
         return Mounting(root, T_root_lidar, note="; ".join(notes), is_stated=False)
-    taken = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
-    note = f"no static transform from {bases[0]} to {frame or 'the lidar'}: the mounting {taken}"
+    mounting = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
+    note = f"no static transform from {bases[0]} to {frame or 'the lidar'}: the mounting {mounting}"
     return Mounting("", np.eye(4), note=note if fixed or wheels else "", is_stated=False)
 
 
@@ -178,9 +178,9 @@ def _fixed(indexes: Sequence[FileIndex]) -> tuple[list[StampedPose], dict[str, s
         before = latest.get(each.child, each)
         shift_m, turn_rad = lie.apart(before.T_parent_child, each.T_parent_child)
         if before.parent != each.parent or shift_m > _SHIFT_M or turn_rad > _TURN_RAD:
-            said = (f"{a.parent} → {a.child}: {place_text(a.T_parent_child)}" for a in (before, each))
-            told = f"/tf_static says of {' and then of '.join(said)}"
-            rivals[each.child] = f"{told}; the latest is used, as in tf2: stop the wrong publisher"
+            each_pose = (f"{a.parent} → {a.child}: {place_text(a.T_parent_child)}" for a in (before, each))
+            stated = f"/tf_static states {' and then '.join(each_pose)}"
+            rivals[each.child] = f"{stated}; the latest is used, as in tf2: stop the wrong publisher"
         latest[each.child] = each
     return list(latest.values()), rivals
 

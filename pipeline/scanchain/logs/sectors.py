@@ -1,4 +1,4 @@
-"""Messages that are sectors of a revolution: detected from the first messages, and assembled into sweeps."""
+"""Messages that are sectors of a revolution: detected in the first messages, assembled into sweeps."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 
-_SAMPLE = 250  # points of a message, evenly sampled, from which its direction and width are estimated
+# limits chosen with the lidars of tests/logs/test_sectors.py
+_SAMPLE = 250  # number of evenly spaced points of a message that determine its direction and width
 _TURN_RAD = 2.0 * np.pi
 _WIDEST_RAD = 4.0 / 3.0 * np.pi  # angular width of a message above which it is a sweep by itself
 _FEWEST = 3  # number of messages after which a lidar that always faces one direction is recognized
-MOST = 1000  # largest number of messages sampled; sampling stops once each is clearly a sweep by itself
-_REVOLUTIONS = 2.0  # least number of revolutions in the sample
-_WIDTHS = (0.5, 1.5)  # limits of a message's width over the angle to the next: less leaves gaps, more is no sector
-_REGULAR = 0.6  # least share of messages at the usual angle to the next, without a blind sector or lost messages
+MOST = 1000  # largest number of messages sampled; usually fewer suffice
+_REVOLUTIONS = 2.0  # smallest number of revolutions in the sample
+_WIDTHS = (0.5, 1.5)  # limits of a sector's width over the angle to the next
+_REGULAR = 0.6  # smallest share of messages at the usual angle to the next; others are lost or blind sectors
 _SLOWEST_S = 1.5  # longest revolution of a lidar; a slower rotation may be the robot's
-_CLEAR_RAD = 2.0 / 3.0 * np.pi  # angle between messages up to which its sign is the sense of rotation
-_SAME = 0.1  # share of that angle within which a message one revolution later has the same direction
+_CLEAR_RAD = 2.0 / 3.0 * np.pi  # largest angle between messages that shows the sense of rotation
+_SAME = 0.1  # share of a sector by which directions may differ that count as equal
 _MISSING = 0.75  # length of a gap, in revolutions, above which it ends the sweep
 
 
@@ -48,12 +49,12 @@ class Sectors(NamedTuple):
 
     def note(self, topic: str) -> str:
         """Description of the sectors and of their assembly, as text."""
-        holds = f"each message holds {360.0 / self.per_sweep:.3g}° of a revolution"
-        return f"{topic}: {holds}: {self.per_sweep:.3g} messages are assembled to one sweep"
+        covers = f"each message covers {360.0 / self.per_sweep:.3g}° of a revolution"
+        return f"{topic}: {covers}: {self.per_sweep:.3g} messages are assembled to one sweep"
 
 
 def expected_sweeps(messages: int, sectors: Sectors | None) -> int:
-    """Number of sweeps in ``messages`` messages; an incomplete last one counts if it is at least half."""
+    """Number of sweeps in ``messages`` messages; an incomplete last one counts from half a revolution on."""
     return messages if sectors is None else max(int(messages / sectors.per_sweep + 0.5), 1)
 
 
@@ -226,7 +227,7 @@ class Assembler:
         return np.float32(part.angle_rad) + self.sectors.sense * turned_rad
 
     def notes(self) -> list[str]:
-        """Note on sweeps that were left out."""
+        """Note on sweeps left out."""
         sweeps = f"{counted(self.incomplete, 'sweep')} of {self.topic}"
         left_out = f"{sweeps} left out: less than half of a revolution, before a gap or the end"
         return [left_out] if self.incomplete else []

@@ -1,6 +1,6 @@
-"""Messages of a log: the part that is read by log time, how many they are, and all of them, decoded in order.
+"""Messages of a log: their chosen part, their number, and all of them, decoded, in order of log time.
 
-Chunks and files may overlap; they are unpacked and decoded ahead in threads.
+Chunks and files may overlap; they are decompressed and decoded ahead in threads.
 """
 
 from __future__ import annotations
@@ -36,40 +36,42 @@ from scanchain.threads import threads
 
 
 class Span(NamedTuple):
-    """Log times in nanoseconds, both ends included."""
+    """Interval of log times, both ends included."""
 
     begin_ns: int
     end_ns: int
 
     @property
     def duration_s(self) -> float:
-        """Seconds from one end to the other."""
+        """Length in seconds."""
         return (self.end_ns - self.begin_ns) * 1e-9
 
-    def holds(self, message: Message) -> bool:
-        """True if the message was logged within it."""
+    def contains(self, message: Message) -> bool:
+        """True if the message was logged within the interval."""
         return self.begin_ns <= message.log_time_ns <= self.end_ns
 
-    def meets(self, block: Block) -> bool:
-        """True if the block may hold messages of the span."""
+    def overlaps(self, block: Block) -> bool:
+        """True if the block may contain messages of the interval."""
         return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
 
 
-_LONG_GAP_NS = 60_000_000_000  # without any message
-_LONGEST_GAP_NS = 86_400_000_000_000  # without any message between two files of one log
+_LONG_GAP_NS = 60_000_000_000  # longest time without any message that is not reported
+_LONGEST_GAP_NS = 86_400_000_000_000  # longest time between two files of one log: a day
+_BLOCKS_AHEAD = 4  # largest number of decoded blocks that wait, twice as many of a remote log
+_MOST_BYTES_AHEAD = 256_000_000  # largest decompressed size of the blocks that wait; limits memory
 
 EVERYTHING = Span(0, (1 << 64) - 1)
 
 
 def whole_span(indexes: Sequence[FileIndex]) -> Span:
-    """From the first message of all topics to the last, (0, 0) where there is none."""
+    """From the first to the last message of all topics; (0, 0) if there is none."""
     blocks = _timed(indexes)
     begin_ns = min((block.start_ns for block in blocks), default=0)
     return Span(begin_ns, max((block.end_ns for block in blocks), default=0))
 
 
 def chosen_span(whole: Span, config: LogConfig) -> Span:
-    """From ``log.start_s`` to ``log.end_s``, counted from the first message; everything where neither is set."""
+    """From ``log.start_s`` to ``log.end_s`` after the first message; everything if neither is set."""
     if config.start_s == 0.0 and config.end_s == inf:
         return EVERYTHING
     begin_ns = whole.begin_ns + round(config.start_s * 1e9)
@@ -78,48 +80,47 @@ def chosen_span(whole: Span, config: LogConfig) -> Span:
 
 
 def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
-    """Warnings about the chosen part: an end beyond that of the log, long gaps within it."""
+    """Warnings about the chosen part: long gaps, or an end after that of the log."""
     whole_s = whole_span(indexes).duration_s
-    is_beyond = whole_s < config.end_s < inf
-    beyond = f"--end {config.end_s:g} s has no effect: the log ends at {whole_s:.1f} s"
-    return [*([beyond] if is_beyond else []), *gap_notes(indexes, config)]
+    late_end = f"--end {config.end_s:g} s has no effect: the log ends at {whole_s:.1f} s"
+    return [*([late_end] if whole_s < config.end_s < inf else []), *gap_notes(indexes, config)]
 
 
 def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     """Warnings about gaps of more than a minute in the chosen part."""
     begin_ns, notes = whole_span(indexes).begin_ns, []
-    for before, behind in _long_gaps(indexes, config):
-        files = [indexes[block.file].path.name for block in (before, behind)]
-        where = f" between {files[0]} and {files[1]}" if before.file != behind.file else ""
+    for before, after in _long_gaps(indexes, config):
+        files = [indexes[block.file].path.name for block in (before, after)]
+        where = f" between {files[0]} and {files[1]}" if before.file != after.file else ""
         notes.append(
-            f"no message for {duration(1e-9 * (behind.start_ns - before.end_ns))} from "
-            f"{1e-9 * (before.end_ns - begin_ns):.1f} s on{where}: read as one log all the same; "
+            f"no message for {duration(1e-9 * (after.start_ns - before.end_ns))} from "
+            f"{1e-9 * (before.end_ns - begin_ns):.1f} s on{where}; read as one log: "
             "--start and --end choose a part"
         )
     return notes
 
 
 def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
-    """Refuse files with scans that lie too far apart in time to be parts of one log. Raises InputError.
+    """Check that files with scans are close enough in time to be parts of one log. Raises InputError.
 
-    Files without scans, as of a calibration, may be of any time.
+    Files without scans, such as a calibration, may be of any time.
     """
     scanned = {
         index.number
         for index in indexes
         if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
     }
-    for before, behind in _long_gaps(indexes, config, scanned):
-        gap_ns = behind.start_ns - before.end_ns
-        if before.file != behind.file and gap_ns > _LONGEST_GAP_NS:
+    for before, after in _long_gaps(indexes, config, scanned):
+        gap_ns = after.start_ns - before.end_ns
+        if before.file != after.file and gap_ns > _LONGEST_GAP_NS:
             raise InputError(
-                f"{indexes[before.file].path} ends {duration(1e-9 * gap_ns)} before {indexes[behind.file].path} "
-                "begins: they are not parts of one log; run each by itself, or all of them with scanchain batch"
+                f"{indexes[before.file].path} ends {duration(1e-9 * gap_ns)} before {indexes[after.file].path} "
+                "begins, so they are not parts of one log; run each separately, or all with scanchain batch"
             )
 
 
 def are_parts(indexes: Sequence[FileIndex]) -> bool:
-    """True if no two files hold the same lidar's scans of one time, and none begins a minute after the others."""
+    """True if no two files have scans of one lidar at the same time, and no gap is longer than a minute."""
     last: dict[str, int] = {}
     for index in sorted(indexes, key=lambda index: whole_span([index])):
         span = whole_span([index])
@@ -127,16 +128,16 @@ def are_parts(indexes: Sequence[FileIndex]) -> bool:
             if span.begin_ns < last.get(topic, 0):
                 return False
             last[topic] = span.end_ns
-    return not any(before.file != behind.file for before, behind in _long_gaps(indexes, LogConfig()))
+    return not any(before.file != after.file for before, after in _long_gaps(indexes, LogConfig()))
 
 
 def _long_gaps(
     indexes: Sequence[FileIndex], config: LogConfig, files: Collection[int] | None = None
 ) -> Iterator[tuple[Block, Block]]:
-    """The blocks before and behind gaps of more than a minute in the chosen part, or in that of some files."""
+    """Blocks before and after gaps of more than a minute in the chosen part, of all files or of some."""
     span = chosen_span(whole_span(indexes), config)
     last: Block | None = None
-    for block in sorted(filter(span.meets, _timed(indexes)), key=lambda block: block.start_ns):
+    for block in sorted(filter(span.overlaps, _timed(indexes)), key=lambda block: block.start_ns):
         if files is not None and block.file not in files:
             continue
         if last is not None and block.start_ns - last.end_ns > _LONG_GAP_NS:
@@ -145,30 +146,30 @@ def _long_gaps(
 
 
 def _timed(indexes: Sequence[FileIndex]) -> list[Block]:
-    """Blocks that hold messages; all of them if none is known to."""
+    """Blocks that contain messages; all of them if none is known to."""
     blocks = [block for index in indexes for block in index.blocks]
     return [block for block in blocks if not block.may_be_empty] or blocks
 
 
 def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
-    """Number of messages of a topic in the span."""
+    """Number of messages of a topic in an interval."""
     count = 0
     for index in indexes:
         wanted = index.numbers_of(topic)
-        for block in filter(span.meets, index.blocks):
+        for block in filter(span.overlaps, index.blocks):
             if block.counts and span.begin_ns <= block.start_ns <= block.end_ns <= span.end_ns:
                 count += sum(block.counts.get(number, 0) for number in wanted)
             elif index.may_hold(block, wanted):
-                count += sum(span.holds(message) for message in messages_of(index, block, wanted))
+                count += sum(span.contains(message) for message in messages_of(index, block, wanted))
     return count
 
 
 def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: LogConfig) -> int:
-    """Number of scans of the topic in the chosen part, every n-th. Raises InputError where there is none."""
+    """Number of scans of a topic in the chosen part, every n-th. Raises InputError if there is none."""
     name, span = name_of(indexes), chosen_span(whole, config)
     total = sum(index.counts.get(number, 0) for index in indexes for number in index.numbers_of(topic))
     if not total:
-        remedy = damage_of(indexes) or "; scanchain info lists what there is"
+        remedy = damage_of(indexes) or "; scanchain info lists the topics"
         raise InputError(f"{name}: topic {topic} has no messages{remedy}")
     chosen = total if span == EVERYTHING else count_messages(indexes, topic, span)
     if not chosen:
@@ -177,7 +178,7 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
 
 
 def nothing_in_part(what: str, whole: Span, config: LogConfig) -> InputError:
-    """Error of a part that holds nothing."""
+    """Error for a part without messages."""
     start, end = f"--start {config.start_s:g} s", f"--end {config.end_s:g} s"
     part = f"between {start} and {end}" if config.start_s else f"before {end}"
     part = f"after {start}" if config.end_s == inf else part
@@ -185,7 +186,7 @@ def nothing_in_part(what: str, whole: Span, config: LogConfig) -> InputError:
 
 
 def complete(index: FileIndex) -> None:
-    """Add the channels and counts that a file without a full summary has inside its chunks."""
+    """Add the channels and counts inside the chunks of a file without a complete summary."""
     counts = index.indexed_counts()
     unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
     for block in sorted(index.blocks, key=lambda each: unknown.isdisjoint(each.counts)):
@@ -199,9 +200,9 @@ def complete(index: FileIndex) -> None:
 
 
 def _begin(index: FileIndex) -> None:
-    """Give log times of 0, as before the first /clock, that of the first other message.
+    """Replace log times of 0, as before the first /clock, by that of the first other message.
 
-    A log may begin at 0, but then its clock does not stand still there, nor jump from there.
+    In a log that really begins at 0 the clock neither stands still nor jumps there.
     """
     untimed = [block for block in index.blocks if block.start_ns == 0 and not block.may_be_empty]
     messages = [message for block in untimed for message in messages_of(index, block)]
@@ -221,7 +222,7 @@ def _begin(index: FileIndex) -> None:
 
 
 def ends_of(indexes: Sequence[FileIndex], topic: str) -> Span:
-    """From the first message of a topic to the last, by the chunks they are in; (0, 0) where unknown."""
+    """From the first to the last message of a topic, read from the chunks they are in; (0, 0) if unknown."""
     times_ns: list[int] = []
     for index in indexes:
         for number in index.numbers_of(topic):
@@ -232,28 +233,23 @@ def ends_of(indexes: Sequence[FileIndex], topic: str) -> Span:
 
 
 def messages_of(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> list[Message]:
-    """The messages of a block, of all channels or of those wanted; none where it is damaged, which is noted."""
+    """Messages of a block, of the wanted channels or of all; none, and a line of damage, if it is damaged."""
     try:
         return read_block(index, block, wanted).messages
     except DamagedBlockError as error:
-        index.note_damage(f"{error}; it was left out")
+        index.add_damage(f"{error}; it is skipped")
         return []
 
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
-_BLOCKS_AHEAD = 4  # that wait decoded, at most
-_REMOTE_TIMES = 2  # as many wait of a remote log, each one request
-_MOST_BYTES_AHEAD = 256_000_000
-
-_SAMPLED_BLOCKS = 8  # number of first blocks of a topic that are searched
 
 
 def decoded_messages(
     indexes: Sequence[FileIndex], decoders: Decoders, span: Span, *, damage: list[str], ahead: int = _BLOCKS_AHEAD
 ) -> Iterator[Decoded]:
-    """Every message of a topic that has a decoder, by log time; ties in the order of the files.
+    """Messages of the topics that have a decoder, by log time; at equal times in the order of the files.
 
-    At most ``ahead`` blocks wait decoded. What is damaged is left out and named in ``damage``.
+    ahead : largest number of decoded blocks that wait; damage : extended by what is skipped
     """
     wanted = [index.numbers_of(*decoders) for index in indexes]
 
@@ -261,11 +257,11 @@ def decoded_messages(
         try:
             contents = read_block(indexes[block.file], block, wanted[block.file])
         except DamagedBlockError as error:
-            return [], f"{error}; it was left out"
+            return [], f"{error}; it is skipped"
         decoded = [
             Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message))
             for message in contents.messages
-            if span.holds(message)
+            if span.contains(message)
         ]
         release(indexes[block.file], block)
         return decoded, contents.damage
@@ -273,7 +269,7 @@ def decoded_messages(
     blocks = _blocks_of(indexes, wanted, span)
     waiting: list[tuple[int, int, int, int, Decoded]] = []
     is_remote = any(index.fetch is not None for index in indexes)
-    ahead *= _REMOTE_TIMES if is_remote else 1
+    ahead *= 2 if is_remote else 1  # each is a request
     results = _ahead(blocks, decode, ahead, damage, workers=max(threads(), ahead * is_remote))
     for (block, following), messages in zip(pairwise([*blocks, None]), results, strict=True):
         assert block is not None
@@ -284,9 +280,9 @@ def decoded_messages(
 
 
 def _blocks_of(indexes: Sequence[FileIndex], wanted: Sequence[set[int]], span: Span) -> list[Block]:
-    """Those that may hold messages of the wanted channels of each file, by time."""
+    """Blocks that may contain messages of the wanted channels of each file, by time."""
     found = [block for index in indexes for block in index.blocks if index.may_hold(block, wanted[block.file])]
-    return sorted(filter(span.meets, found), key=lambda block: (block.start_ns, block.file, block.offset))
+    return sorted(filter(span.overlaps, found), key=lambda block: (block.start_ns, block.file, block.offset))
 
 
 def _decode(decoder: Callable[[memoryview], object], message: Message) -> object:
@@ -306,7 +302,7 @@ def _ahead(
     *,
     workers: int,
 ) -> Iterator[list[Decoded]]:
-    """Contents in the order of the blocks, decoded by threads that end when the iterator is closed."""
+    """Messages in the order of the blocks, decoded by threads, which end when the iterator is closed."""
     running: deque[tuple[Block, Future[tuple[list[Decoded], str]]]] = deque()
     size = 0
     pool = ThreadPoolExecutor(workers, thread_name_prefix="scanchain-read")
@@ -333,12 +329,12 @@ def sampled_messages(
     decode: Callable[[memoryview], object],
     span: Span | None = None,
     *,
-    blocks: int = _SAMPLED_BLOCKS,
+    blocks: int = 8,
     most: int | None = None,
 ) -> Iterator[Decoded]:
-    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out.
+    """Decoded messages of a topic's first blocks, or of blocks spread over a span; without malformed ones.
 
-    blocks : number of those that are read; most : number of messages of each, at random but in order
+    blocks : number of blocks read; most : largest number of messages of each, drawn at random, in order
     """
     chosen, at_random = EVERYTHING if span is None else span, Random(0)
     found = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
@@ -346,7 +342,7 @@ def sampled_messages(
         found = [found[k * (len(found) - 1) // max(blocks - 1, 1)] for k in range(blocks)]
     for block in found[:blocks]:
         messages = messages_of(indexes[block.file], block)
-        messages = [each for each in messages if each.channel.topic == topic and chosen.holds(each)]
+        messages = [each for each in messages if each.channel.topic == topic and chosen.contains(each)]
         if most is not None and len(messages) > most:
             messages = [messages[k] for k in sorted(at_random.sample(range(len(messages)), most))]
         for message in messages:

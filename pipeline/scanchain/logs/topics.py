@@ -10,7 +10,7 @@ from scanchain.errors import InputError
 from scanchain.logs.index import Channel, FileIndex, damage_of, name_of
 from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_moving_transforms, kind, role
 
-_MOST_LISTED = 8
+_MOST_LISTED = 8  # largest number of topics in an error
 _USUAL_TRUTH = LogConfig().ground_truth_topic
 _IMU = ("sensor_msgs/Imu",)
 _GNSS = (
@@ -38,11 +38,11 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     if not lidars:
         absent = f"topic {wanted}, nor any other" if wanted and wanted not in channels else "lidar topic"
         raise InputError(
-            f"{name}: has no {absent} of a type that is understood ({LIDAR_TYPES}); "
-            f"it holds: {_listed(channels.values())}{damage_of(indexes)}"
+            f"{name}: has no {absent} of a supported type ({LIDAR_TYPES}); "
+            f"it contains: {_listed(channels.values())}{damage_of(indexes)}"
         )
     if wanted:
-        is_other = f"topic {_listed([channels[wanted]])} is no lidar's" if wanted in channels else ""
+        is_other = f"topic {_listed([channels[wanted]])} is not of a lidar" if wanted in channels else ""
         why = is_other or f"has no topic {wanted}"
         raise InputError(f"{name}: {why}; choose --topic from: {_listed(lidars)}")
     raise InputError(f"{name}: has several lidar topics; choose one with --topic: {_listed(lidars, indexes)}")
@@ -95,7 +95,7 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
         elif kind(channel) in _IMU or kind(channel) in _GNSS:
             found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
         elif has_poses(channel) and topic != wheels:
-            use = f"--gt {topic} takes them as the truth, --log.odometry_topic {topic} as wheels"
+            use = f"--gt {topic} uses them as ground truth, --log.odometry_topic {topic} as wheels"
             found.append(OtherSensor("poses", topic, f"not used; {use}"))
     return found
 
@@ -106,7 +106,7 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
         return channels[wanted]
     on_tf = " or of transforms" if key == "log.odometry_topic" else ""
     raise InputError(
-        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor of stamped poses{on_tf}"
+        f"{name_of(indexes)}: {key} {wanted} is not a topic of nav_msgs/Odometry or of stamped poses{on_tf}"
         f"; these are: {_listed(channels.values())}"
     )
 

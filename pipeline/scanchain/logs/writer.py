@@ -1,4 +1,4 @@
-"""ROS 2 messages serialized as CDR, and the MCAP logs they are written to; ROS is not needed."""
+"""ROS 2 messages serialized as CDR, and MCAP logs of them; written without ROS."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: 
 
 @cache
 def schema_text(name: str) -> bytes:
-    """The definition of ``pkg/msg/Type`` followed by those of every type it uses, as rosbag2 writes it.
+    """Definition of ``pkg/msg/Type`` and of every type it uses, as rosbag2 writes it.
 
     Empty for a type that is not part of ROS 2.
     """
@@ -123,7 +123,7 @@ def schema_text(name: str) -> bytes:
         return b""
 
 
-CHUNK_BYTES = 4 * 1024 * 1024
+CHUNK_BYTES = 4 * 1024 * 1024  # uncompressed; smaller chunks compress less, larger ones cost memory on reading
 
 
 class LogWriter:
@@ -143,7 +143,7 @@ class LogWriter:
             destination.parent.mkdir(parents=True, exist_ok=True)
             self._stream: IO[bytes] = self._partial.open("wb")
         except OSError as error:
-            raise InputError(f"{destination}: not writable ({error.strerror}); choose another place") from error
+            raise InputError(f"{destination}: not writable ({error.strerror}); choose another path") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile=profile, library="scanchain")
         self._schema, self._channel = cache(self._writer.register_schema), cache(self._writer.register_channel)

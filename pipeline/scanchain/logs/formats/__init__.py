@@ -1,17 +1,41 @@
-"""Logs in formats other than MCAP: indexed with messages made on reading, or converted to a temporary MCAP."""
+"""What a log format declares, and its two ways: messages made on reading, or conversion to a temporary MCAP."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
+from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.index import Block, Channel, FileIndex
 from scanchain.logs.mcap.index import index_file
 from scanchain.logs.writer import LogWriter, schema_text
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A log format, as its module declares it.
+
+    name : value of ``log.format``
+    description : paths of the format, for errors
+    recognizes : True for a path of the format, by its first bytes (empty for a folder) or its contents
+    index : index of a path of the format as the file of a log with this number
+    suffixes : of its files; a folder that holds several has logs, parts of one log, or scans of one log
+    parts_of : files that a folder names as the parts of a log, to be read one by one; empty if it names none
+    """
+
+    name: str
+    description: str
+    recognizes: Callable[[Path, bytes], bool]
+    index: Callable[[Path, int, LogConfig], FileIndex]
+    suffixes: tuple[str, ...] = ()
+    files_are: Literal["logs", "parts", "scans"] = "logs"
+    parts_of: Callable[[Path], Sequence[Path]] = lambda _: ()
 
 
 def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
@@ -51,13 +75,13 @@ def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
     return tuple(int(digits) for digits in re.findall(r"\d+", path.stem)), path.name
 
 
-def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
-    """Note on the files of a folder that contain scans as well, but in another format than those read."""
+def left_out(folder: Path, read: str, suffixes: Sequence[str]) -> list[str]:
+    """Note on files of a folder that contain scans, too, but in another format than those read."""
     counts = Counter(file.suffix.lower() for file in folder.iterdir() if file.is_file())
-    others = ", ".join(f"{counts[each]:,} {each}" for each in suffixes if counts[each] and each != taken)
+    others = ", ".join(f"{counts[each]:,} {each}" for each in suffixes if counts[each] and each != read)
     if not others:
         return []
-    return [f"{folder}: only its {taken} files are read, left out are {others}; give those a folder of their own"]
+    return [f"{folder}: only its {read} files are read, not {others}; move those to another folder"]
 
 
 class UnknownFormatError(Exception):

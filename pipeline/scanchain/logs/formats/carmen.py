@@ -1,4 +1,4 @@
-"""CARMEN logs as text, bzip2 or gzip: /scan, /odom, /tf_static and, from a simulator, /ground_truth.
+"""CARMEN logs, plain or compressed, as /scan, /odom, /tf_static and, of a simulator, /ground_truth.
 
 The order of the lines is preserved: the log time is the stamp of a scan or, where stamps step back, slightly later
 than that of the previous scan. Format: https://carmen.sourceforge.net/logger_playback.html
@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, printable
-from scanchain.logs.formats import UnknownFormatError, temporary_index
-from scanchain.logs.index import FileIndex
+from scanchain.logs.formats import Format, UnknownFormatError, temporary_index
+from scanchain.logs.index import FileIndex, most_decompressed_file
 from scanchain.logs.writer import (
     LATEST_NS,
     Link,
@@ -32,44 +33,40 @@ from scanchain.logs.writer import (
     place_of,
 )
 
-_LEAST_STEP_NS = 100_000  # least step between the log times of two scans
+_LEAST_STEP_NS = 100_000  # smallest step between the log times of two scans, which preserves their order
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
 SCANS = (b"FLASER", b"ROBOTLASER1")
 _LEAST_CODE_M = 81.83  # smallest range in meters that a SICK LMS uses as an error code, such as for no return
 _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
-_HALF_TURN = math.pi
-
-_MOST_RATIO, _LEAST_BYTES = 200, 1 << 24  # largest compression ratio, applied beyond _LEAST_BYTES of text
-_AT_ONCE = 256  # bytes of text decompressed at once, all of which are lost where they are damaged
+_AT_ONCE = 256  # bytes of text decompressed at once; all of them are lost if they are damaged
 _LONGEST_LINE = 1 << 18  # largest length of a line in bytes; a longer one is malformed
-_HEAD_LINES = 256  # number of first lines from which files of other formats are recognized
 
 
-def is_carmen(head: bytes) -> bool:
+def is_carmen(_: Path, head: bytes) -> bool:
     """True if a file is compressed, or begins with a comment or a word of capitals and digits as in CARMEN."""
     word = head.split(maxsplit=1)[0] if head.strip() else b""
     is_word = word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper()
     return head.startswith((b"BZh", b"\x1f\x8b")) or word.startswith(b"#") or is_word
 
 
-def index_carmen(path: Path, number: int) -> FileIndex:
+def index_carmen(path: Path, number: int, _: LogConfig) -> FileIndex:
     """Index of the messages of a log's lines. Raises UnknownFormatError if no line is of a known kind."""
     malformed, damage = [0, 0], list[str]()
     others = Counter[bytes]()
     index = temporary_index(path, number, lambda log: _write(log, read_lines(path, damage), malformed, others))
     if not index.counts and not malformed[1]:
         absent = f"text without a line of {b', '.join(KINDS).decode()}"
-        text = b"\n".join(islice(read_lines(path, []), _HEAD_LINES))
+        text = b"\n".join(islice(read_lines(path, []), 256))  # from which other formats are recognized
         raise UnknownFormatError(text, "".join(damage).removeprefix(f"{path}: ") or absent)
     index.damage += damage
     if malformed[1]:
-        lines = f"{counted(malformed[1], 'malformed line')} left out (the first: line {malformed[0]})"
+        lines = f"{counted(malformed[1], 'malformed line')} skipped (the first: line {malformed[0]})"
         index.damage.append(f"{path}: {lines}")
     if others:
         listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in others.items())
-        index.notes.append(f"{path}: lines of kinds that are not read: {printable(listed)}")
+        index.notes.append(f"{path}: lines of kinds that are not supported: {printable(listed)}")
     return index
 
 
@@ -126,8 +123,8 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
     if words[0] == b"FLASER":
         count = int(words[1])
         poses = _numbers(words[2 + count :], 6)
-        step_rad = _STEPS_RAD.get(count, _HALF_TURN / max(count - 1, 1))
-        first_rad = -0.5 * step_rad * (count - 1) if count == 401 else -0.5 * _HALF_TURN
+        step_rad = _STEPS_RAD.get(count, math.pi / max(count - 1, 1))
+        first_rad = -0.5 * step_rad * (count - 1) if count == 401 else -0.5 * math.pi
         ranges_m = _numbers(words[2:], count)
         mounting = planar(offset_m, 0.0, 0.0)
     else:
@@ -152,7 +149,7 @@ def planar(x_m: float, y_m: float, yaw_rad: float) -> Any:
 
 def _numbers(words: list[bytes], count: int) -> list[float]:
     if not 0 <= count <= len(words):
-        raise ValueError(f"{count} numbers are stated, {len(words)} words follow")
+        raise ValueError(f"{count} numbers stated, {len(words)} words found")
     return [float(word) for word in words[:count]]
 
 
@@ -165,13 +162,13 @@ def read_lines(path: Path, damage: list[str]) -> Iterator[bytes]:
     size, text = 0, bytearray()
     try:
         with path.open("rb") as file:
-            head, most = file.read(3), _LEAST_BYTES + _MOST_RATIO * path.stat().st_size
+            head, most = file.read(3), most_decompressed_file(path.stat().st_size)
         opened = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else Path.open
         with opened(path, "rb") as file:
             while block := file.read1(_AT_ONCE):
                 size += len(block)
                 if size > most:
-                    raise InputError(f"{path}: unpacks to more than {most:,} bytes; is it a CARMEN log?")
+                    raise InputError(f"{path}: decompresses to more than {most:,} bytes; is it a CARMEN log?")
                 text += block
                 if len(text) > 2 * _LONGEST_LINE:
                     *lines, rest = bytes(text).split(b"\n")
@@ -180,5 +177,10 @@ def read_lines(path: Path, damage: list[str]) -> Iterator[bytes]:
     except (zlib.error, EOFError, ValueError, OSError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # raised by the system, not by bz2 or gzip
             raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
-        damage.append(f"{path}: does not unpack beyond byte {size} of the text ({error})")
+        damage.append(f"{path}: cannot be decompressed after byte {size} of the text ({error})")
     yield from bytes(text).split(b"\n")
+
+
+FORMAT = Format(
+    "carmen", "a CARMEN .log or .clf (also .bz2, .gz)", is_carmen, index_carmen, (".log", ".clf", ".bz2", ".gz")
+)

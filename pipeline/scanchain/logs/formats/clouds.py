@@ -20,17 +20,16 @@ import lzf
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, printable
-from scanchain.logs.formats import add_block, add_channel, left_out, natural_order
+from scanchain.logs.formats import Format, add_block, add_channel, left_out, natural_order
 from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
-_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # a stamp's unit in nanoseconds, by its number of digits since 2001
-_FIRST_FILES = 3  # number of first files that are tried for the note on the fields
-_NS = 1_000_000_000
+_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # unit of a stamp by its number of digits, for stamps after 2001
 
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
-_MOST_COLUMNS = 16
+_MOST_COLUMNS = 16  # of an array of points, as of log.bin_columns; more indicate another kind of array
 XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 
 _PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8"} | {
@@ -44,13 +43,13 @@ _PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_MOST_HEADER_LINES, _MOST_DIGITS = 1000, 20  # largest number of lines of a header, and of digits of a count in it
+_MOST_HEADER_LINES = 1000  # of a PCD or PLY file; more indicate another kind of file
 
 _ONE_AT_A_TIME = Lock()  # for .npy headers: NumPy parses them with ast, which is not thread-safe in Python 3.11
 
 
 class CloudFileError(Exception):
-    """A file that contradicts its header; the message says where."""
+    """A file that contradicts its header; the text states where."""
 
     def __init__(self, text: str) -> None:
         super().__init__(printable(text))
@@ -66,7 +65,7 @@ def _rows(file: IO[bytes], point: np.dtype[np.void], count: int, *, is_text: boo
         try:
             rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
         except ValueError as error:
-            raise CloudFileError(f"is no list of {count} points ({error})") from error
+            raise CloudFileError(f"is not a list of {count} points ({error})") from error
     else:
         data = file.read(min(count * point.itemsize, size))
         rows = np.frombuffer(data, point, len(data) // max(point.itemsize, 1))
@@ -108,9 +107,9 @@ def read_npy(path: Path) -> NDArray[np.void]:
     except OSError:
         raise
     except Exception as error:  # anything that NumPy, ast and tokenize raise for a damaged header
-        raise CloudFileError("is no .npy array of numbers") from error
+        raise CloudFileError("is not a .npy array of numbers") from error
     if not isinstance(array, np.ndarray):
-        raise CloudFileError("is an archive of arrays, no .npy array; save each cloud in a file of its own")
+        raise CloudFileError("is an archive of arrays, not a .npy array; save each cloud in a separate file")
     if array.dtype.names and array.ndim == 1:
         return array
     is_list = array.ndim == 2 and 3 <= array.shape[1] <= _MOST_COLUMNS
@@ -149,14 +148,14 @@ def read_pcd(path: Path) -> NDArray[np.void]:
             if count < 0:
                 raise ValueError(f"how many points there are, but {count}")
         except (KeyError, IndexError, ValueError) as error:
-            raise CloudFileError(f"is no PCD: its header does not state {error}") from error
+            raise CloudFileError(f"is not a PCD file: its header does not state {error}") from error
         if form == "binary_compressed":
-            return _lzf_unpacked(file, point, count)
+            return _lzf_decompressed(file, point, count)
         return _rows(file, point, count, is_text=form == "ascii")
 
 
 def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
-    """Words of each line up to the one that begins with ``last``, at most of the first thousand lines."""
+    """Words of each line up to the one that begins with ``last``, at most a thousand lines."""
     for _ in range(_MOST_HEADER_LINES):
         words = file.readline(65536).decode("ascii", "replace").split()
         yield words
@@ -164,19 +163,19 @@ def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
             break
 
 
-def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
+def _lzf_decompressed(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """Points compressed by LZF, stored field by field."""
     packed_size, size = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     packed = file.read(packed_size)
     if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
         raise CloudFileError(
-            f"does not unpack: {size} bytes are stated for {count} points, {len(packed)} are there"
+            f"cannot be decompressed: {size} bytes are stated for {count} points, {len(packed)} are present"
         )
     data = b""
     with suppress(ValueError):
         data = lzf.decompress(packed, size)
     if data is None or len(data) != size:
-        raise CloudFileError("does not unpack: its bytes are damaged")
+        raise CloudFileError("cannot be decompressed: its bytes are damaged")
     rows = np.empty(count, point)
     offset = 0
     for name in point.names or ():
@@ -202,50 +201,48 @@ def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
             case ["format", form, *_] if form in _PLY_ORDERS:
                 pass
             case ["element", element, number, *_]:
-                if element == "vertex" and number.isdigit() and len(number) < _MOST_DIGITS:
+                if element == "vertex" and number.isdigit() and len(number) < 20:
                     count = int(number)
                 elif not fields:
-                    raise CloudFileError(f"has {element} before its vertices, which is not understood")
+                    raise CloudFileError(f"has {element} before its vertices, which is not supported")
             case ["property", kind, name] if kind in _PLY_TYPES and element == "vertex":
                 fields.append((name, _PLY_ORDERS.get(form, "<") + _PLY_TYPES[kind]))
             case ["property", *_] if element == "vertex":
-                raise CloudFileError(f"has the vertex property {' '.join(words[1:])!r}, which is not understood")
+                raise CloudFileError(f"has the vertex property {' '.join(words[1:])!r}, which is not supported")
     if not form or not fields or words != ["end_header"]:
-        raise CloudFileError("is no PLY with vertices, or its header does not end")
+        raise CloudFileError("is not a PLY file with vertices, or its header does not end")
     if len(dict(fields)) < len(fields):
-        raise CloudFileError(f"has a vertex property twice among {' '.join(name for name, _ in fields)}")
+        raise CloudFileError(f"has two vertex properties of one name: {' '.join(name for name, _ in fields)}")
     return np.dtype(fields), count, form
 
 
-def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: int = 4) -> FileIndex:
+def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
     """Index of a folder's files as the scans of /points; of several formats the first in SUFFIXES is read.
 
-    rate_hz : rate of the scans, stamped from the epoch on; 0 takes the stamps from the names
-    bin_columns : number of float32 values per point in .bin files
     Raises InputError if the names contain no stamps, or the .bin files do not have such points.
     """
     found = sorted((file for file in folder.iterdir() if file.is_file()), key=natural_order)
     kinds = {suffix: [file for file in found if file.suffix.lower() == suffix] for suffix in SUFFIXES}
     suffix, files = next(((suffix, files) for suffix, files in kinds.items() if files), ("", []))
     if not files:
-        raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
-    if rate_hz:
-        stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))]
+        raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that contains them")
+    if config.rate_hz:
+        stamps_ns = [round(k * 1e9 / config.rate_hz) for k in range(len(files))]
     else:
         stamps_ns = [
             stamp for file in files if (stamp := stamp_of_name(file.stem.removesuffix(".pcd"))) is not None
         ]
     if len(set(stamps_ns)) < len(files):
         raise InputError(
-            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
+            f"{folder}: names such as {files[0].name} contain no stamp; set the rate of the scans, "
             "as in --log.rate_hz 10"
         )
     index = FileIndex(folder, number)
-    raw = point_of_columns(np.dtype("<f4"), bin_columns)
+    raw = point_of_columns(np.dtype("<f4"), config.bin_columns)
     sizes = [file.stat().st_size for file in files]
     if suffix == ".bin" and np.mean(np.mod(sizes, raw.itemsize) == 0) < 0.5:  # some of the files may be damaged
         raise InputError(
-            f"{files[0]}: has {sizes[0]} bytes, no rows of {bin_columns} float32 numbers; set "
+            f"{files[0]}: has {sizes[0]} bytes, no multiple of {config.bin_columns} float32 numbers; set "
             "their number, as in --log.bin_columns 5, or save clouds as .npy, PCD or PLY"
         )
     index.notes += [*_found(folder, files, raw), *left_out(folder, suffix, SUFFIXES)]
@@ -268,13 +265,13 @@ def contents_of(
         data = pack_cloud(stamp_ns, frame, read(file))
     except (CloudFileError, OSError) as error:
         unreadable = Message(channel, stamp_ns, memoryview(b""), f"{file.name} {error}")
-        return Contents([unreadable], f"{file}: {error}; it was left out")
+        return Contents([unreadable], f"{file}: {error}; it is skipped")
     return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
 
 def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:
-    """Note on the fields of the files, by the first file that can be read."""
-    for file in files[:_FIRST_FILES]:
+    """Note on the fields of the files, by the first file that can be read; none if three cannot."""
+    for file in files[:3]:
         with suppress(CloudFileError, OSError):
             points = read_cloud_file(file, raw)
             kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
@@ -295,9 +292,16 @@ def stamp_of_name(stem: str) -> int | None:
     """
     stamp_ns = LATEST_NS
     if match := re.search(r"(?<!\d)(\d{1,10})\.(\d{1,9})$", stem):
-        stamp_ns = int(match[1]) * _NS + int(match[2].ljust(9, "0"))
+        stamp_ns = int(match[1]) * 1_000_000_000 + int(match[2].ljust(9, "0"))
     elif match := re.search(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$", stem):
-        stamp_ns = int(match[1]) * _NS + int(match[2])
+        stamp_ns = int(match[1]) * 1_000_000_000 + int(match[2])
     elif match := re.search(r"(?<!\d)([1-9]\d*)$", stem):
         stamp_ns = int(match[1]) * _UNITS_NS.get(len(match[1]), LATEST_NS)
     return stamp_ns if stamp_ns < LATEST_NS else None
+
+
+def _is_folder(path: Path, _: bytes) -> bool:
+    return path.is_dir() and any(each.suffix.lower() in SUFFIXES for each in path.iterdir())
+
+
+FORMAT = Format("clouds", "a folder of PCD, PLY, .npy or .bin files", _is_folder, index_clouds, SUFFIXES, "scans")

@@ -17,35 +17,33 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scanchain import lie
+from scanchain.config import LogConfig
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError, counted, shown
-from scanchain.logs.formats import add_block, add_channel, natural_order
+from scanchain.logs.formats import Format, add_block, add_channel, natural_order
 from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
 from scanchain.logs.index import Block, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_odometry, place
 
-_TRUTH = -1  # offset that marks the block of the ground truth
-_POSE_BYTES = 720
+_TRUTH = -1  # offset of the block of the ground truth
 _TIME = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?$")
 Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
-_EARTH_M = 6378137.0
-_MOST_LATITUDE = 89.0  # largest latitude in degrees; the Mercator projection is singular at the poles
-_MOST_NUMBER = 1e12  # largest number in a table, in meters, seconds or degrees; a larger one indicates damage
-_MOST_CALIBRATION = 1e6  # largest number in a calibration; a larger one, infinity or NaN indicates damage
-_NS = 1_000_000_000
+_EARTH_M = 6378137.0  # equatorial radius of WGS 84, as in KITTI's development kit
+_MOST_LATITUDE_DEG = 89.0  # the Mercator projection is singular at the poles
+_MOST_NUMBER = 1e12  # meters, seconds or degrees; larger numbers, infinity or NaN indicate damage
 
 
-def index_kitti_raw(folder: Path, number: int) -> FileIndex:
+def index_kitti_raw(folder: Path, number: int, _: LogConfig) -> FileIndex:
     """Index of a drive of the raw recordings (``..._sync``); ground truth is its GPS/INS, moved to the lidar."""
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
     return _index(FileIndex(folder, number), folder / "velodyne_points/data", times_ns, lambda: _raw_truth(folder))
 
 
-def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
+def index_kitti_odometry(folder: Path, number: int, _: LogConfig) -> FileIndex:
     """Index of a sequence of the odometry benchmark (``sequences/00``) with ground truth in ``poses/00.txt``."""
     times = folder / "times.txt"
-    times_ns = _checked(times, np.rint(_table(times, 1)[:, 0] * _NS))  # one line of seconds per scan
+    times_ns = _checked(times, np.rint(_table(times, 1)[:, 0] * 1_000_000_000))  # one line of seconds per scan
     return _index(
         FileIndex(folder, number), folder / "velodyne", times_ns, lambda: _benchmark_truth(folder, times_ns)
     )
@@ -78,13 +76,13 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
     """Index of /velodyne_points, and of /ground_truth if readable; a file's name is the index of its time."""
     files, truth = sorted(folder.glob("*.bin"), key=natural_order), Truth()
     if not files:
-        raise InputError(f"{folder}: has no .bin file; of the raw recordings take the synced ones (..._sync)")
+        raise InputError(f"{folder}: has no .bin file; use the synced raw recordings (..._sync)")
     try:
         truth = read_truth()
     except FileNotFoundError as absent:
         index.notes.append(f"{absent}: is absent, so there is no ground truth")
     except (InputError, LinAlgError) as error:
-        index.note_damage(f"{error}; until then there is no ground truth")
+        index.add_damage(f"{error}; there is no ground truth until then")
     numbers = [int(file.stem) for file in files if file.stem.isdigit()]
     if len(numbers) < len(files) or max(numbers) >= len(times_ns):
         raise InputError(
@@ -95,13 +93,13 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
         add_block(index, entry, file.stat().st_size, [times_ns[numbers[entry]]], {lidar: 1})
     if truth:
         poses = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
-        add_block(index, _TRUTH, _POSE_BYTES * len(truth), [each for each, _ in truth], {poses: len(truth)})
+        add_block(index, _TRUTH, 720 * len(truth), [each for each, _ in truth], {poses: len(truth)})
 
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         channel = index.channels[next(iter(block.counts))]
         if block.offset == _TRUTH:
-            said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
-            return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")
+            packed = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
+            return Contents([Message(channel, each, memoryview(data)) for each, data in packed], "")
         read = partial(read_raw, point=XYZI)
         return contents_of(files[block.offset], channel, block.start_ns, read, "velodyne")
 
@@ -110,13 +108,13 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
 
 
 def read_times(file: Path) -> list[int]:
-    """Times in nanoseconds of lines such as ``2011-09-26 13:02:25.594360375``, taken as UTC."""
+    """Times in nanoseconds of lines such as ``2011-09-26 13:02:25.594360375``, read as UTC."""
     try:
         if odd := next((line for line in _lines(file) if not _TIME.match(line)), ""):
             raise ValueError(shown(odd))
         times_ns = np.array(_lines(file), "datetime64[ns]").astype(np.int64)
     except ValueError as error:
-        raise InputError(f"{file}: is no list of times ({error}); download it again") from error
+        raise InputError(f"{file}: is not a list of times ({error}); download it again") from error
     return _checked(file, times_ns)
 
 
@@ -134,8 +132,8 @@ def _entry(file: Path, name: str, shape: tuple[int, ...]) -> Matrix:
     except (KeyError, ValueError) as error:
         count = int(np.prod(shape))
         raise InputError(f"{file}: has no line {name}: of {count} numbers ({error}); download it again") from error
-    if not (np.abs(numbers) < _MOST_CALIBRATION).all():
-        raise InputError(f"{file}: its line {name}: holds {numbers.ravel().tolist()}; download it again")
+    if not (np.abs(numbers) < _MOST_NUMBER).all():
+        raise InputError(f"{file}: its line {name}: contains {numbers.ravel().tolist()}; download it again")
     return numbers
 
 
@@ -148,8 +146,8 @@ def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
     rows = np.vstack([_table(file, 6)[:1] for file in sorted(folder.glob("*.txt"))] or [np.empty((0, 6))])
     if not len(rows):
         return np.empty((0, 4, 4))
-    if np.abs(rows[:, 0]).max() > _MOST_LATITUDE:
-        raise InputError(f"{folder}: has a latitude beyond {_MOST_LATITUDE:g} degrees; download it again")
+    if np.abs(rows[:, 0]).max() > _MOST_LATITUDE_DEG:
+        raise InputError(f"{folder}: has a latitude beyond {_MOST_LATITUDE_DEG:g} degrees; download it again")
     latitude, longitude, up_m, roll, pitch, yaw = rows.T
     scale = np.cos(np.radians(latitude[0]))
     T_world_imu = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -178,10 +176,12 @@ def _table(file: Path, columns: int) -> Matrix:
         rows = np.loadtxt(lines, comments=None, usecols=range(columns), ndmin=2) if lines else np.empty(0)
     except ValueError as error:
         raise InputError(
-            f"{file}: is no table of {columns} numbers a line ({error}); download it again"
+            f"{file}: is not a table of {columns} numbers per line ({error}); download it again"
         ) from error
     if not len(rows) or not (np.abs(rows) < _MOST_NUMBER).all():
-        raise InputError(f"{file}: is empty, or holds numbers that are not finite or too large; download it again")
+        raise InputError(
+            f"{file}: is empty or contains numbers that are not finite or too large; download it again"
+        )
     return rows
 
 
@@ -191,3 +191,14 @@ def _lines(file: Path) -> list[str]:
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); download it again") from error
     return [line.strip() for line in lines if line.strip()]
+
+
+RAW = Format(
+    "kitti-raw", "a KITTI raw drive", lambda path, _: (path / "velodyne_points").is_dir(), index_kitti_raw
+)
+ODOMETRY = Format(
+    "kitti-odometry",
+    "a KITTI odometry sequence",
+    lambda path, _: (path / "velodyne").is_dir() and (path / "times.txt").is_file(),
+    index_kitti_odometry,
+)

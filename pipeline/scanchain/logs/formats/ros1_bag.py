@@ -1,8 +1,8 @@
 """ROS 1 bags, complete or truncated, indexed or not; their messages are not converted.
 
 Bags are walked record by record. The messages of a chunk are counted by the INDEX records after it if the end of
-the bag states the same counts, else, and in all chunks of a damaged bag, by decompressing it. The type of a record
-is determined by its fields where its opcode contradicts them.
+the bag states the same counts; otherwise, and in a damaged bag, by decompressing it. Where opcode and fields of a
+record disagree, the fields determine its type.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -21,33 +21,33 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted
-from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message, unpack
-from scanchain.logs.mcap.index import most_unpacked
+from scanchain.logs.formats import Format
+from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message, most_decompressed, unpack
 from scanchain.logs.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 Data = mmap.mmap | memoryview | bytes
-_NS = 1_000_000_000
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
 _COUNT = struct.Struct("<II")  # connection, number of its messages
 _ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
-_LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
+_LONGEST_HEAD = 1 << 16  # bytes; a longer head of a record is damage
 _FIELDS = {  # a field that identifies each type of record; "count" is checked last
     MESSAGE: b"time", HEADER: b"index_pos", CHUNK: b"compression", CHUNK_INFO: b"chunk_pos", CONNECTION: b"topic",
     INDEX: b"count",
 }  # fmt: skip
 _OUTSIDE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
 _INSIDE = re.compile(rb"\x04\0\0\0op=[\x02\x07]")  # of a chunk: opcode of a message, a connection
-_MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
+_MOST_BEFORE = 256  # largest number of bytes of a head before its opcode, when a record is searched
 
 
 class Record(NamedTuple):
-    """A record: its fields by name, the bytes where it and its data begin, and its end, maybe beyond the file's.
+    """A record: its fields by name, the bytes at which it and its data begin, and its end, even after the file's.
 
-    opcode : according to the fields; the opcode stated in the file may differ
+    opcode : by the fields; the one stated in the file may differ
     """
 
     opcode: int
@@ -96,7 +96,7 @@ def _define(index: FileIndex, record: Record, data: Data) -> None:
 
 
 def read_records(
-    data: Data, offset: int, sought: re.Pattern[bytes], gaps: list[tuple[int, int]]
+    data: Data, offset: int, opcodes: re.Pattern[bytes], gaps: list[tuple[int, int]]
 ) -> Iterator[Record]:
     """Successive records; damaged ranges are added to ``gaps``, and reading resumes at the next match."""
     record = read_record(data, offset)
@@ -106,21 +106,21 @@ def read_records(
             yield record
             offset, record = record.end, following
             continue
-        behind = next_record(data, offset, offset if record is None else record.end, sought)
-        limit = len(data) if behind is None else behind.offset
-        if record is not None and (record.end <= limit or (behind is None and record.opcode == CHUNK)):
+        resumed = next_record(data, offset, offset if record is None else record.end, opcodes)
+        limit = len(data) if resumed is None else resumed.offset
+        if record is not None and (record.end <= limit or (resumed is None and record.opcode == CHUNK)):
             yield record
         gaps.append((offset, limit))
-        offset, record = limit, behind
+        offset, record = limit, resumed
 
 
-def next_record(data: Data, offset: int, stated_end: int, sought: re.Pattern[bytes]) -> Record | None:
+def next_record(data: Data, offset: int, stated_end: int, opcodes: re.Pattern[bytes]) -> Record | None:
     """The first record after the offset whose opcode matches; None where there is none.
 
     stated_end : byte at which the damaged record ends if its length is right; connections before it are ignored,
         because chunks contain connections too
     """
-    for match in sought.finditer(data, offset + 1):
+    for match in opcodes.finditer(data, offset + 1):
         for begin in range(match.start() - _LENGTH.size, max(offset, match.start() - _MOST_BEFORE), -1):
             record = read_record(data, begin)
             if record is None or record.begin < match.end() or record.end > len(data):
@@ -144,11 +144,11 @@ def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
     return fields
 
 
-def index_ros1_bag(path: Path, number: int) -> FileIndex:
+def index_ros1_bag(path: Path, number: int, _: LogConfig) -> FileIndex:
     """Index of a bag. Raises InputError for one that is empty, encrypted or of an old version."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
+            raise InputError(f"{path}: is a bag of an old version; convert it with rosbag migrate")
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     index = FileIndex(path, number, data)
     index.contents = partial(_contents, index)
@@ -176,19 +176,19 @@ def _walk(index: FileIndex) -> dict[int, dict[int, int]]:
         try:
             if record.fields.get(b"op") != bytes([record.opcode]):
                 name = f"{index.path}: the record at byte {record.offset}"
-                index.damage.append(f"{name} is marked as another record; it was read all the same")
-            _take(index, record, stated)
+                index.damage.append(f"{name} has an opcode that contradicts its fields; it is read by the fields")
+            _add_record(index, record, stated)
         except (struct.error, ValueError) as error:
             what = str(error) if isinstance(error, ValueError) else "is malformed"
-            index.damage.append(f"{index.path}: the record at byte {record.offset} {what} and was left out")
+            index.damage.append(f"{index.path}: the record at byte {record.offset} {what}; it is skipped")
     for begin, end in gaps:
-        cut = f"{index.path}: cut off, or damaged to its end, at byte {begin}"
-        resumed = f"{index.path}: the record at byte {begin} is damaged; reading went on at byte {end}"
+        cut = f"{index.path}: truncated, or damaged to its end, at byte {begin}"
+        resumed = f"{index.path}: the record at byte {begin} is damaged; reading resumes at byte {end}"
         index.damage.append(cut if end == len(index.data) else resumed)
     return stated
 
 
-def _take(index: FileIndex, record: Record, stated: dict[int, dict[int, int]]) -> None:
+def _add_record(index: FileIndex, record: Record, stated: dict[int, dict[int, int]]) -> None:
     """Add a record to the index. Raises struct.error or ValueError if it is malformed."""
     if record.opcode == CONNECTION:
         _define(index, record, index.data)
@@ -208,15 +208,15 @@ def _count(index: FileIndex, stated: dict[int, dict[int, int]]) -> None:
     In a damaged bag these are all chunks. If an undamaged bag states no counts at its end, all chunks are read for
     any topic.
     """
-    is_sure = not index.damage
-    index.is_consistent = bool(stated) or not is_sure
+    is_undamaged = not index.damage
+    index.is_consistent = bool(stated) or not is_undamaged
     for place, block in enumerate(index.blocks):
         begin = block.offset - block.head
         is_contradicted = bool(stated) and stated.get(begin) != block.counts
-        if is_contradicted and is_sure:
+        if is_contradicted and is_undamaged:
             name = f"{index.path}: the chunk at byte {begin}"
-            index.damage.append(f"{name} has a damaged index; its messages were counted by unpacking it")
-        if is_contradicted or not (is_sure and block.counts):
+            index.damage.append(f"{name} has a damaged index; its messages are counted by decompressing it")
+        if is_contradicted or not (is_undamaged and block.counts):
             index.blocks[place] = _counted(index, block)
 
 
@@ -224,8 +224,8 @@ def _chunk(index: FileIndex, record: Record) -> Block:
     """Block of a chunk, its messages not yet counted. Raises struct.error or ValueError if it is malformed."""
     end = len(index.data)
     size, claimed = min(record.end, end) - record.begin, record.number(b"size")
-    if claimed > most_unpacked(size):
-        raise ValueError(f"claims to unpack from {size} to {claimed} bytes, more than is accepted,")
+    if claimed > most_decompressed(size):
+        raise ValueError(f"states that its {size} bytes decompress to {claimed} bytes, more than is accepted")
     name = record.text(b"compression")
     where = {"head": record.begin - record.offset, "is_cut": record.end > end}
     return Block(index.number, record.begin, size, "" if name == "none" else name, claimed, 0, 0, **where)
@@ -236,7 +236,7 @@ def _indexed(index: FileIndex, record: Record) -> Block:
     block, entries = index.blocks[-1], np.frombuffer(index.data[record.begin : record.end], _ENTRY)
     if not len(entries):
         return block
-    times_ns = entries["s"].astype(np.int64) * _NS + entries["ns"]
+    times_ns = entries["s"].astype(np.int64) * 1_000_000_000 + entries["ns"]
     start_ns, end_ns = int(times_ns.min()), int(times_ns.max())
     if block.counts:
         start_ns, end_ns = min(start_ns, block.start_ns), max(end_ns, block.end_ns)
@@ -256,7 +256,7 @@ def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Con
     """Messages of a chunk; connections found in it are added to the index."""
     name = f"{index.path}: the chunk at byte {block.offset}"
     messages: list[Message] = []
-    met = Counter[int]()
+    read = Counter[int]()
     gaps: list[tuple[int, int]] = []
     undefined = malformed = 0
     payload = unpack(index, block)
@@ -267,18 +267,23 @@ def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Con
             elif record.opcode == MESSAGE:
                 seconds, nanoseconds = _TIME.unpack(record.fields.get(b"time", b""))
                 number = record.number(b"conn")
-                met[number] += 1
+                read[number] += 1
                 channel = index.channels.get(number)
                 undefined += channel is None
                 if channel is not None:
                     messages.append(
-                        Message(channel, seconds * _NS + nanoseconds, payload[record.begin : record.end])
+                        Message(channel, seconds * 1_000_000_000 + nanoseconds, payload[record.begin : record.end])
                     )
         except struct.error:
             malformed += 1
-    lost = sum(max(count - met[number], 0) for number, count in block.counts.items())
+    lost = sum(max(count - read[number], 0) for number, count in block.counts.items())
     if (malformed or gaps) and not block.is_cut:
-        return Contents(messages, f"{name}: records in it are malformed and were left out")
+        return Contents(messages, f"{name}: malformed records in it are skipped")
     if undefined:
-        return Contents(messages, f"{name}: {counted(undefined, 'message')} of no known connection")
+        return Contents(messages, f"{name}: {counted(undefined, 'message')} of an unknown connection")
     return Contents(messages, f"{name}: {counted(lost, 'indexed message')} missing in it" if lost else "")
+
+
+FORMAT = Format(
+    "ros1", "a ROS 1 .bag", lambda _, head: head.startswith(b"#ROSBAG"), index_ros1_bag, (".bag",), "parts"
+)

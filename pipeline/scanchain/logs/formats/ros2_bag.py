@@ -1,4 +1,4 @@
-"""ROS 2 bags, read by rosbags; of a damaged SQLite database the rows that are still readable are copied first."""
+"""ROS 2 bags, read by rosbags; of a damaged SQLite database the readable rows are copied first."""
 
 from __future__ import annotations
 
@@ -18,22 +18,29 @@ from typing import Any
 
 import zstandard
 
+from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, one_line
 from scanchain.logs.files import size_of
-from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.mcap.index import most_unpacked
+from scanchain.logs.formats import Format
+from scanchain.logs.index import (
+    Block,
+    Channel,
+    Contents,
+    FileIndex,
+    Message,
+    most_decompressed,
+    most_decompressed_file,
+)
 from scanchain.logs.writer import schema_text
 
 _BLOCK_BYTES = 4_000_000  # approximate size of a block in bytes of the file
-_MOST_BLOCKS = 8192
-_MOST_UNPACKED = 1 << 27  # largest decompressed size of the messages of a block in bytes
-_MOST_RATIO, _LEAST_BYTES = 200, 1 << 25  # largest compression ratio of a file, applied beyond _LEAST_BYTES
-_LATEST_NS = (1 << 63) - 1
+_MOST_BLOCKS = 8192  # largest number of blocks, as each one costs a query
+_MOST_DECOMPRESSED = 1 << 27  # largest decompressed size of the messages of a block in bytes
 _MODE = re.compile(r"^( *compression_mode:)[ \"']*(\w*).*$", re.MULTILINE)
 _COUNT = re.compile(r"^  message_count: *(\d{1,15})$", re.MULTILINE)
 
-_ROW_BYTES = 16  # smallest number of bytes of a row
-_MOST_FAILURES = 5_000  # largest number of failed queries per table, about half a second
+_ROW_BYTES = 16  # smallest size of a row, which limits the row ids of a damaged table
+_MOST_FAILURES = 5_000  # largest number of failed queries per table; they take about half a second
 _TABLES = (
     "SELECT name, sql FROM sqlite_master WHERE name IN ('schema', 'topics', 'message_definitions', 'messages')"
 )
@@ -46,7 +53,7 @@ CREATE INDEX timestamp_idx ON messages (timestamp);
 """
 
 
-def index_ros2_bag(path: Path, number: int) -> FileIndex:
+def index_ros2_bag(path: Path, number: int, _: LogConfig) -> FileIndex:
     """Index of a .db3 or the folder of a ROS 2 bag, in blocks of equal time. Raises InputError if not readable."""
     bag = _Bag(path)
     index, reader = FileIndex(path, number, damage=[bag.damage] if bag.damage else []), bag.reader
@@ -54,18 +61,18 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
         encoding = each.ext.serialization_format
         are_texts = all(isinstance(text, str) for text in (each.topic, each.msgtype, encoding))
         if not (are_texts and isinstance(each.msgcount, int)):
-            raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes a new one")
+            raise InputError(f"{path}: its metadata.yaml is damaged; rewrite it with ros2 bag reindex")
         if each.msgcount:
             language = "ros2idl" if each.msgdef.format.name == "IDL" else "ros2msg"
             definition = each.msgdef.data.encode() or schema_text(each.msgtype)
             named = each.topic, encoding, id_, each.msgtype, language
             channel = Channel((number, id_), *named, definition)
-            _, key = bag.channels.setdefault((each.topic, each.msgtype), channel).key
+            key = bag.channels.setdefault((each.topic, each.msgtype), channel).key[1]
             index.channels.setdefault(key, channel)
             index.counts[key] = index.counts.get(key, 0) + each.msgcount
     lost = reader.message_count - sum(each.msgcount for each in reader.connections)
     if lost > 0 and not bag.damage:
-        index.damage.append(f"{path}: {counted(lost, 'message')} of no topic that it lists")
+        index.damage.append(f"{path}: {counted(lost, 'message')} of a topic that it does not list")
     if index.channels:  # spans of equal length, each with a few megabytes on average
         size, length_ns = size_of(path), reader.end_time - bag.begin_ns
         count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
@@ -79,8 +86,14 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     return index
 
 
-def parts_of_bag(folder: Path) -> list[Path]:
-    """MCAP files of a ROS 2 bag in order; the folder itself for another storage or a compressed bag."""
+def _is_bag(path: Path, head: bytes) -> bool:
+    return head.startswith(b"SQLite format 3\0") or path.suffix == ".db3" or (path / "metadata.yaml").is_file()
+
+
+def _parts_of(folder: Path) -> list[Path]:
+    """MCAP files of a ROS 2 bag in order; its folder for another storage or if compressed; empty for no bag."""
+    if not (folder / "metadata.yaml").is_file():
+        return []
     from ruamel.yaml import YAML  # importing it takes 0.1 s with rosbags, not needed for other logs
     from ruamel.yaml.error import YAMLError
 
@@ -109,7 +122,7 @@ class _Bag:
         self.lock, self.channels = threading.Lock(), dict[tuple[str, str], Channel]()
         if mode == "file":
             self.metadata = _MODE.sub(r"\1 ''", self.metadata).replace(".zstd", "")
-            self._copy("*.zstd", _unpack)
+            self._copy("*.zstd", _decompress)
         try:
             self._open()
         except Exception as error:  # anything that libraries raise for a damaged file
@@ -139,8 +152,8 @@ class _Bag:
         self.folder, self.opened = folder, into if is_folder else into / self.opened.name
 
     def _rescue(self, reason: str) -> None:
-        """Continue with the rows that SQLite can still read. Raises InputError if there are none."""
-        remedy = "sqlite.org's sqlite3 saves part of a .db3 by .recover, ros2 bag reindex a folder"
+        """Continue with the rows that SQLite can read. Raises InputError if there are none."""
+        remedy = "sqlite3 .recover may save part of a .db3, ros2 bag reindex a folder"
         self.damage = f"{self.path}: cannot be read as a ROS bag ({reason}); copy it again; {remedy}"
         counts = Counter[str]()
         try:
@@ -155,12 +168,12 @@ class _Bag:
         left, stated = counts["left"], _COUNT.search(self.metadata)
         total = max(counts["stated"], int(stated[1]) if stated else 0)
         lost = f"{total - left:,} of {counted(total, 'message')}" if total else "some messages"
-        self.damage = f"{self.path}: {lost} lost: damaged pages; the others were read row by row"
+        self.damage = f"{self.path}: {lost} lost in damaged pages; the others are read row by row"
 
     def contents(self, index: FileIndex, block: Block, wanted: AbstractSet[int] | None) -> Contents:
         """Messages of a block's time span, open-ended for the first and last block: the metadata may be wrong."""
         begin_ns, end_ns = block.start_ns if block.offset else 0, block.end_ns + 1
-        end_ns = _LATEST_NS if block.offset == len(index.blocks) - 1 else end_ns
+        end_ns = (1 << 63) - 1 if block.offset == len(index.blocks) - 1 else end_ns
         chosen = {key: c for key, c in self.channels.items() if wanted is None or c.key[1] in wanted}
         found: list[tuple[Channel, int, bytes]] = []
         with self.lock:
@@ -174,34 +187,34 @@ class _Bag:
                     self._rescue(one_line(error))
         if self.reader is not reader:
             return self.contents(index, block, wanted)
-        messages, left = list[Message](), _MOST_UNPACKED
+        messages, left = list[Message](), _MOST_DECOMPRESSED
         for channel, time_ns, data in found:
-            unpacked, defect = _unpacked(data, left) if self.is_packed else (data, "")
-            left -= len(unpacked)
-            messages.append(Message(channel, time_ns, memoryview(unpacked), defect))
+            message, defect = _decompressed(data, left) if self.is_packed else (data, "")
+            left -= len(message)
+            messages.append(Message(channel, time_ns, memoryview(message), defect))
         return Contents(messages, self.damage)
 
 
-def _unpacked(data: bytes, left: int) -> tuple[bytes, str]:
+def _decompressed(data: bytes, left: int) -> tuple[bytes, str]:
     """Decompressed data of an individually compressed message, and the reason for a failure, empty if none."""
-    most = min(most_unpacked(len(data)), left)
+    most = min(most_decompressed(len(data)), left)
     try:
         if zstandard.frame_content_size(data) > most:
-            return b"", f"unpacks to more than {most:,} bytes"
+            return b"", f"decompresses to more than {most:,} bytes"
         return zstandard.ZstdDecompressor().decompress(data, max_output_size=most), ""
     except zstandard.ZstdError as error:
-        return b"", f"does not unpack to {most:,} bytes or less ({one_line(error)})"
+        return b"", f"cannot be decompressed to at most {most:,} bytes ({one_line(error)})"
 
 
-def _unpack(file: Path, unpacked: Path) -> None:
+def _decompress(file: Path, decompressed: Path) -> None:
     """Decompress a file up to the first damage. Raises InputError if the result is implausibly large."""
-    most = _LEAST_BYTES + _MOST_RATIO * file.stat().st_size
-    with file.open("rb") as stored, unpacked.open("wb") as copy, suppress(zstandard.ZstdError):
-        unpacker = zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True)
-        while data := unpacker.read(1 << 20):
+    most = most_decompressed_file(file.stat().st_size)
+    with file.open("rb") as stored, decompressed.open("wb") as copy, suppress(zstandard.ZstdError):
+        reader = zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True)
+        while data := reader.read(1 << 20):
             copy.write(data)
             if copy.tell() > most:
-                raise InputError(f"{file}: unpacks to more than {most:,} bytes; is it a ROS 2 bag?")
+                raise InputError(f"{file}: decompresses to more than {most:,} bytes; is it a ROS 2 bag?")
 
 
 def _copy_rows(counts: Counter[str], file: Path, copy: Path) -> None:
@@ -243,3 +256,8 @@ def _rows(base: sqlite3.Connection, table: str, last: int) -> Iterator[list[Any]
             if first < last and failures < _MOST_FAILURES:
                 middle = (first + last) // 2
                 ranges += (first, middle), (middle + 1, last)
+
+
+FORMAT = Format(
+    "ros2", "a ROS 2 .db3 or the folder of a ROS 2 bag", _is_bag, index_ros2_bag, (".db3",), "parts", _parts_of
+)

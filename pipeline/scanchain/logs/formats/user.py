@@ -44,7 +44,7 @@ def index_scans(path: Path, number: int, name: str) -> FileIndex:
     index = temporary_index(path, number, lambda log: _write(log, path, name))
     scans = sum(index.counts.values())
     if not scans:
-        raise InputError(f"{path}: {name} yields no scan of it; check the path and the format")
+        raise InputError(f"{path}: {name} yields no scan; check the path and the format")
     index.notes.append(f"{path}: {counted(scans, 'scan')} read by {name} (log.format)")
     return index
 
@@ -57,18 +57,18 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
         scans: Iterator[Any] = iter(make(path).scans())
     for number in count():
         with plugins.own_code(f"{path}: scan {number} of {name}"):
-            given = next(scans, end)
-            if given is end:
+            yielded = next(scans, end)
+            if yielded is end:
                 break
-            if not isinstance(given, tuple) or len(given) != 3:
-                raise InputError(f"is {shown(given)}; wanted a tuple (stamp_s, points, times_s or None)")
-            stamp_s, points, times_s = given
+            if not isinstance(yielded, tuple) or len(yielded) != 3:
+                raise InputError(f"is {shown(yielded)}; wanted a tuple (stamp_s, points, times_s or None)")
+            stamp_s, points, times_s = yielded
             scan = Scan.of(points, stamp_s, times_s)
             if not 0 <= scan.stamp_ns < LATEST_NS:
                 raise InputError(f"stamp_s is {stamp_s}; wanted 0 to {LATEST_NS * 1e-9:.0f} s")
             dimension = dimension or scan.points.shape[1]
             if scan.points.shape[1] != dimension:
-                raise InputError(f"points are no (N, {dimension}) as those before; yield one kind")
+                raise InputError(f"points are not (N, {dimension}) as before; yield one dimension only")
         rows = np.asarray(points, np.float32)
         rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # z = 0, from which the log is recognized as 2D
         fields = {"time": np.asarray(times_s, np.float32)} if len(scan.times_s) else {}

@@ -1,8 +1,8 @@
 """Index of an MCAP file: its blocks of messages, channels and damage, by its summary or by walking its records.
 
-A summary that agrees with its CRC and its statistics gives the position of every message; a damaged chunk shows
-when it is unpacked. Files that were cut off, never finished or damaged there are walked record by record, chunks
-by their heads alone; behind damage the walk resumes at the next record that is one.
+A summary that agrees with its CRC and its statistics states the position of every message; damaged chunks are
+detected when they are decompressed. Files without such a summary (truncated, unfinished or damaged) are walked
+record by record, chunks by their heads alone; after damage the walk resumes at the next valid record.
 Format: https://mcap.dev/spec
 """
 
@@ -28,25 +28,21 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from scanchain.errors import InputError
 from scanchain.files import Source
 from scanchain.logs.files import RemoteFile
-from scanchain.logs.index import Block, FileIndex
+from scanchain.logs.index import Block, FileIndex, most_decompressed
 from scanchain.logs.mcap.records import CHUNK_HEAD, MALFORMED, MESSAGE_HEAD, RECORD, contents, define, definition
 
-# least number of bytes of a record's body
+# smallest number of bytes of a record's body, by the specification
 _LEAST_BYTES = {Opcode.HEADER: 8, Opcode.MESSAGE: MESSAGE_HEAD.size, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8}
 _DATA_END = RECORD.pack(Opcode.DATA_END, 4)
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
-_TAIL_BYTES = 65_536  # number of bytes of a file read at first; most summaries lie in it
-_REPEATED = 4  # number of ranges of a remote file retained: the first blocks are read more than once
-_LONGEST_NAME = 16  # bytes; no name of a compression is longer
-_LARGEST_CHUNK = 1 << 30  # largest size of a chunk in bytes; one beyond is damage
-_MODEST_CHUNK = 1 << 25  # size in bytes up to which a chunk's stated size is accepted at any ratio
-_MOST_TIMES = 20  # largest ratio of the unpacked to the stored size of a larger chunk
-_LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about this size
-_WINDOW = 1 << 20  # bytes searched at once
+_TAIL_BYTES = 65_536  # bytes read from the end of a file first; most summaries fit, so one request suffices
+_LONGEST_NAME = 16  # bytes of the name of a compression; known ones have 3 or 4
+_LOOSE_BYTES = 1 << 20  # size of the blocks in which messages outside of chunks are read
+_WINDOW = 1 << 20  # bytes that are searched for a record at once; limits memory
 
 
 def index_file(path: Path, number: int) -> FileIndex:
-    """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all."""
+    """Index of a file, the ``number``-th of a log. Raises InputError if it is no MCAP file."""
     try:
         with path.open("rb") as file:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -57,7 +53,7 @@ def index_file(path: Path, number: int) -> FileIndex:
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
     index = empty_index(path, number, data)
-    if not _take_summary(index, len(data), needs_crc=True):
+    if not _add_summary(index, len(data), needs_crc=True):
         index = empty_index(path, number, data)
         index.is_consistent = False
         Walk(index).walk()
@@ -65,12 +61,13 @@ def index_file(path: Path, number: int) -> FileIndex:
 
 
 def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
-    """Index of a remote file by its summary alone, in two or three requests; None where that is incomplete.
+    """Index of a remote file by its summary alone, in two or three requests; None if that is incomplete.
 
-    Any other file has to be walked, which takes all its bytes.
+    Walking a file would read all its bytes.
     """
-    index = empty_index(file.address, number, fetch=lru_cache(_REPEATED)(file.read))
-    return index if _take_summary(index, file.size, needs_crc=False) else None
+    fetch = lru_cache(4)(file.read)  # the first blocks are read more than once
+    index = empty_index(file.address, number, fetch=fetch)
+    return index if _add_summary(index, file.size, needs_crc=False) else None
 
 
 def empty_index(
@@ -82,8 +79,8 @@ def empty_index(
     return index
 
 
-def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
-    """Fill the index by the summary of a file of this size; False where that does not give every message."""
+def _add_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
+    """Add the records of a file's summary; False if it does not state the position of every message."""
     tail = bytes(index.bytes_at(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES)))
     footer = tail[-_FOOTER_BYTES:]
     if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != Opcode.FOOTER:
@@ -96,7 +93,7 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     if crc and zlib.crc32(summary[: -len(MAGIC) - 4]) != crc:
         return False
     try:
-        statistics = _fill(index, summary)
+        statistics = _add_records(index, summary)
     except MALFORMED:
         return False
     if statistics is None or statistics.chunk_count != len(index.blocks):
@@ -107,13 +104,13 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     return is_complete and all(
         block.offset >= block.head
         and block.offset + block.size <= size
-        and block.uncompressed_size <= most_unpacked(block.size)
+        and block.uncompressed_size <= most_decompressed(block.size)
         for block in index.blocks
     )
 
 
-def _fill(index: FileIndex, summary: bytes) -> Statistics | None:
-    """Take in the records up to the closing magic; the statistics among them. Raises one of MALFORMED."""
+def _add_records(index: FileIndex, summary: bytes) -> Statistics | None:
+    """Add the records up to the closing magic and return the statistics among them. Raises one of MALFORMED."""
     statistics = None
     for record in StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True).records:
         if isinstance(record, Schema | Channel):
@@ -126,14 +123,14 @@ def _fill(index: FileIndex, summary: bytes) -> Statistics | None:
 
 
 def _indexed(chunk: ChunkIndex, file: int) -> Block:
-    """A chunk by its index; where the next message index begins gives the number of a channel's messages."""
+    """Block of a chunk by its index; messages are counted by the sizes of the message indexes."""
     end = chunk.chunk_start_offset + chunk.chunk_length
     stated = sorted((offset, channel) for channel, offset in chunk.message_index_offsets.items())
     ends = [*(offset for offset, _ in stated[1:]), end + chunk.message_index_length]
     counts = {
-        channel: (behind - offset - RECORD.size - 6) // 16
-        for (offset, channel), behind in zip(stated, ends, strict=False)
-        if behind - offset > RECORD.size + 6
+        channel: (following - offset - RECORD.size - 6) // 16
+        for (offset, channel), following in zip(stated, ends, strict=False)
+        if following - offset > RECORD.size + 6
     }
     size, times_ns = chunk.compressed_size, (chunk.message_start_time, chunk.message_end_time)
     head = CHUNK_HEAD.size + len(chunk.compression.encode()) + 8
@@ -141,62 +138,62 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
 
 
 class Walk:
-    """Sorts records into an index; a chunk waits for its message index, loose messages for each other."""
+    """Adds the records of a file to its index; the last chunk or sequence of loose messages stays open."""
 
     def __init__(self, index: FileIndex) -> None:
         self.index = index
         self.data = index.data
-        self.open: Block | None = None  # the chunk, or the run of loose messages, that was met last
-        self.times_ns: list[int] = []  # of these messages
-        self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
+        self.open: Block | None = None  # the last chunk or sequence of loose messages
+        self.times_ns: list[int] = []  # of its loose messages
+        self.loose_sizes: deque[int] = deque(maxlen=8)  # of the last records
 
     def walk(self) -> None:
-        """Take in every record, and note what is damaged or missing."""
+        """Add every record, and the damage."""
         index, data = self.index, self.data
-        sought: tuple[int, ...] = ()
+        opcodes: tuple[int, ...] = ()
         offset, end = len(MAGIC), _record_end(index, len(MAGIC))
-        while end or not self._takes_summary(offset):
+        while end or not self._ends_with_summary(offset):
             following = _record_end(index, end) if end else 0
             if end and (following or _is_end(data, end)) and not self._is_shortened(offset, end):
-                self._take(offset, end)
+                self._add(offset, end)
                 offset, end = end, following
                 continue
-            sought = sought or _sought(index)
-            resumed = _next_record(index, offset + 1, sought) or max(data.rfind(_DATA_END, offset + 1), 0)
+            opcodes = opcodes or _opcodes_after_damage(index)
+            resumed = _next_record(index, offset + 1, opcodes) or max(data.rfind(_DATA_END, offset + 1), 0)
             if end and (_chunk_at(index, offset) or not 0 < resumed < end):
-                self._take(offset, end)
+                self._add(offset, end)
                 offset = end
             if not resumed:
-                self._cut_off(offset)
+                self._truncate(offset)
                 break
-            if resumed != offset:  # which is that of a chunk that is cut off
+            if resumed != offset:  # equal for a truncated chunk
                 where = min(offset, resumed)
                 index.damage.append(
-                    f"{index.path}: the record at byte {where} is damaged; reading went on at byte {resumed}"
+                    f"{index.path}: the record at byte {where} is damaged; reading resumes at byte {resumed}"
                 )
                 self._close(where, complete=False)
             offset, end = resumed, _record_end(index, resumed)
         self._close(offset, complete=True)
 
-    def _takes_summary(self, offset: int) -> bool:
-        """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
+    def _ends_with_summary(self, offset: int) -> bool:
+        """True if the data end here and a summary follows, whose channels are added as uncertain ones."""
         uncertain = FileIndex(self.index.path, self.index.number, channels=self.index.uncertain_channels)
         with suppress(*MALFORMED):
             if _is_end(self.data, offset):
-                _fill(uncertain, self.data[offset:])
+                _add_records(uncertain, self.data[offset:])
                 return True
         return False
 
-    def _take(self, offset: int, end: int) -> None:
-        """Sort in the record of these bytes."""
+    def _add(self, offset: int, end: int) -> None:
+        """Add the record in a range of bytes."""
         index, body = self.index, offset + RECORD.size
         opcode, chunk = self.data[offset], _chunk_at(index, offset)
         if chunk is not None:
-            self._take_chunk(chunk, offset)
+            self._add_chunk(chunk, offset)
         elif opcode == Opcode.MESSAGE:
-            self._take_message(offset, end)
+            self._add_message(offset, end)
         elif opcode == Opcode.MESSAGE_INDEX and (self.open is None or not self.open.head):
-            index.note_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
+            index.add_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
         elif opcode == Opcode.MESSAGE_INDEX and self.open is not None:
             (channel,) = struct.unpack_from("<H", self.data, body)
             if count := (end - body - 6) // 16:
@@ -206,7 +203,7 @@ class Walk:
         else:
             self._close(offset, complete=True)
 
-    def _take_message(self, offset: int, end: int) -> None:
+    def _add_message(self, offset: int, end: int) -> None:
         if self.open is None or self.open.head or end - self.open.offset > _LOOSE_BYTES:
             self._close(offset, complete=True)
             self.open = Block(self.index.number, offset, 0, "", 0, 0, 0, Counter())
@@ -217,43 +214,43 @@ class Walk:
             self.loose_sizes.append(end - offset)
 
     def _is_shortened(self, offset: int, end: int) -> bool:
-        """True if a loose message ends in a whole one of a size met lately: so many bytes of it are missing."""
+        """True if a loose message lacks bytes: a complete message of a recent size ends at the same byte."""
         return self.data[offset] == Opcode.MESSAGE and any(
             RECORD.unpack_from(self.data, end - size) == (Opcode.MESSAGE, size - RECORD.size)
             for size in self.loose_sizes
             if size < end - offset
         )
 
-    def _take_chunk(self, chunk: Block, offset: int) -> None:
+    def _add_chunk(self, chunk: Block, offset: int) -> None:
         self._close(offset, complete=True)
         name = f"{self.index.path}: the chunk at byte {offset}"
         if self.data[offset] != Opcode.CHUNK:
-            self.index.damage.append(f"{name} is marked as another record; it was read all the same")
-        if chunk.uncompressed_size <= most_unpacked(chunk.size):
+            self.index.damage.append(f"{name} has another opcode; it is read as a chunk")
+        if chunk.uncompressed_size <= most_decompressed(chunk.size):
             self.open = chunk
             return
         self.index.damage.append(
-            f"{name} claims to unpack from {chunk.size} to {chunk.uncompressed_size} bytes, more than is "
-            "accepted, and was left out"
+            f"{name} states that its {chunk.size} bytes decompress to {chunk.uncompressed_size}, more than is "
+            "accepted; it is skipped"
         )
 
-    def _cut_off(self, offset: int) -> None:
-        """End the walk at the record that is not all there; of a chunk the beginning is retained."""
+    def _truncate(self, offset: int) -> None:
+        """End the walk at an incomplete record; of a chunk the beginning is read."""
         path, size, is_end = self.index.path, len(self.data), _is_end(self.data, offset)
         self._close(offset, complete=is_end)
         where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
         self.index.damage.append(
-            f"{path}: the summary at byte {offset} is damaged or cut off"
+            f"{path}: the summary at byte {offset} is damaged or truncated"
             if is_end
-            else f"{path}: cut off at byte {size}{where}, without the closing magic"
+            else f"{path}: truncated at byte {size}{where}, without the closing magic"
         )
         chunk = _chunk_at(self.index, offset)
         if chunk is not None:
-            self._take_chunk(chunk, offset)
+            self._add_chunk(chunk, offset)
             self._close(size, complete=False)
 
     def _close(self, offset: int, *, complete: bool) -> None:
-        """End the chunk or the run of loose messages at this byte; incomplete counts are discarded."""
+        """Add the open chunk or loose messages, which end here, to the index; without incomplete counts."""
         block, self.open = self.open, None
         if block is not None and block.head:
             self.index.blocks.append(block if complete else replace(block, counts={}))
@@ -263,18 +260,13 @@ class Walk:
             self.times_ns = []
 
 
-def most_unpacked(size: int) -> int:
-    """Largest number of bytes that a chunk or a message of so many may unpack to."""
-    return min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
-
-
 def _is_end(data: mmap.mmap | bytes, offset: int) -> bool:
-    """True if the data end here; behind is at most a summary."""
+    """True if the data section ends here; at most a summary follows."""
     return data[offset : offset + len(_DATA_END)] == _DATA_END
 
 
 def _record_end(index: FileIndex, offset: int) -> int:
-    """The byte behind the record at ``offset``; 0 where there is none of the data section, or not all of one."""
+    """End of the record of the data section at ``offset``; 0 if there is none, or an incomplete one."""
     data, body = index.data, offset + RECORD.size
     if body > len(data):
         return 0
@@ -296,7 +288,7 @@ def _record_end(index: FileIndex, offset: int) -> int:
 
 
 def _chunk_at(index: FileIndex, offset: int) -> Block | None:
-    """The chunk whose record begins here, whatever its opcode; None where its length is not stated twice alike."""
+    """Block of the chunk that begins here, whatever its opcode; None unless its two stated lengths agree."""
     head = index.data[offset : offset + CHUNK_HEAD.size + _LONGEST_NAME + 8]
     if len(head) < CHUNK_HEAD.size + 8:
         return None
@@ -308,27 +300,26 @@ def _chunk_at(index: FileIndex, offset: int) -> Block | None:
     if size != length + RECORD.size - begin:
         return None
     compression = head[CHUNK_HEAD.size : begin - 8].decode("utf-8", "replace")
-    there = len(index.data) - offset - begin
-    where = index.number, offset + begin, min(size, there)
-    return Block(*where, compression, uncompressed, *times_ns, head=begin, is_cut=size > there)
+    remaining = len(index.data) - offset - begin
+    where = index.number, offset + begin, min(size, remaining)
+    return Block(*where, compression, uncompressed, *times_ns, head=begin, is_cut=size > remaining)
 
 
-def _sought(index: FileIndex) -> tuple[int, ...]:
-    """Opcodes of the records that are searched behind damage.
+def _opcodes_after_damage(index: FileIndex) -> tuple[int, ...]:
+    """Opcodes of records at which reading may resume.
 
-    No message is searched outside of the chunks of a file that has them: what is left of a damaged chunk,
-    unchecked, is not taken for messages.
+    In a file with chunks these are chunks only: the rest of a damaged chunk could be mistaken for messages.
     """
     is_chunked = index.blocks or _next_record(index, len(MAGIC), (Opcode.CHUNK, Opcode.MESSAGE_INDEX))
     return (Opcode.CHUNK,) if is_chunked else (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 
-def _next_record(index: FileIndex, offset: int, sought: tuple[int, ...]) -> int:
-    """The first byte from ``offset`` on at which such a record begins, a chunk even if cut off; 0 for none."""
+def _next_record(index: FileIndex, offset: int, opcodes: tuple[int, ...]) -> int:
+    """First byte from ``offset`` on where a record with such an opcode, or a truncated chunk, begins; else 0."""
     data = index.data
     for begin in range(offset, len(data) - RECORD.size, _WINDOW):
         window = np.frombuffer(data, np.uint8, min(_WINDOW + 8, len(data) - begin), begin)
-        likely = np.isin(window[:-8], sought) & ((window[6:-2] | window[7:-1] | window[8:]) == 0)
+        likely = np.isin(window[:-8], opcodes) & ((window[6:-2] | window[7:-1] | window[8:]) == 0)
         for candidate in (begin + np.flatnonzero(likely)).tolist():
             end = _record_end(index, candidate)
             is_sure = data[candidate] == Opcode.MESSAGE_INDEX or _is_end(data, end)

@@ -20,15 +20,15 @@ from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message, n
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # record, start, end, uncompressed size, CRC-32, length of a name
-MALFORMED = (McapError, struct.error, UnicodeDecodeError)  # raised on reading a record that is none
-_MOST_BEHIND = 256  # bytes behind a definition; a longer rest is that of another record with a damaged opcode
+MALFORMED = (McapError, struct.error, UnicodeDecodeError)  # raised for bytes that are no record
+_MOST_TRAILING = 256  # bytes allowed after a definition; more indicate another record with a damaged opcode
 
 
 def definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
-    """The schema or channel that a record defines. Raises one of MALFORMED."""
+    """Schema or channel defined by a record. Raises one of MALFORMED."""
     stream = ReadDataStream(BytesIO(body))
     record = (mcap.records.Schema if opcode == Opcode.SCHEMA else mcap.records.Channel).read(stream)
-    if stream.count + _MOST_BEHIND < len(body):
+    if stream.count + _MOST_TRAILING < len(body):
         raise struct.error("definition of another length than its record")
     return record
 
@@ -47,7 +47,7 @@ def contents(index: FileIndex, block: Block, wanted: AbstractSet[int] | None) ->
     """Messages of a block of the wanted channels, None for all; channels defined in it are added to the index."""
     payload = unpack(index, block, lambda head: CHUNK_HEAD.unpack_from(head)[5])
     messages: list[Message] = []
-    met = undefined = end = 0
+    read = undefined = end = 0
     try:
         while end < len(payload):
             opcode, length = RECORD.unpack_from(payload, end)
@@ -58,7 +58,7 @@ def contents(index: FileIndex, block: Block, wanted: AbstractSet[int] | None) ->
                 define(index, definition(opcode, bytes(payload[begin:end])))
             elif opcode == Opcode.MESSAGE:
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
-                met += 1
+                read += 1
                 channel = index.channels.get(number)
                 undefined += channel is None
                 if channel is not None and (wanted is None or number in wanted):
@@ -66,10 +66,10 @@ def contents(index: FileIndex, block: Block, wanted: AbstractSet[int] | None) ->
             else:
                 raise struct.error("record of no kind that a chunk may hold")
     except MALFORMED:
-        damage = "a record in it is malformed; what follows was left out"
+        damage = "a record in it is malformed; the rest of it is skipped"
         return Contents(messages, "" if block.is_cut else f"{name_of_block(index, block)}: {damage}")
     stated = sum(block.counts.values())
-    damage = f"holds {met} of the {stated} indexed messages" if met < stated else ""
+    damage = f"contains {read} of {stated} indexed messages" if read < stated else ""
     if undefined:
-        damage = f"{counted(undefined, 'message')} of a channel that nothing defines"
+        damage = f"{counted(undefined, 'message')} of an undefined channel"
     return Contents(messages, damage and f"{name_of_block(index, block)}: {damage}")

@@ -1,1 +1,1 @@
-"""Messages taken apart: scans, clouds, poses, in every encoding that is understood."""
+"""Decoders of messages: scans, clouds and poses, in every supported encoding."""

@@ -1,7 +1,7 @@
-"""Foxglove's own messages, LaserScan, PointCloud, PoseInFrame and FrameTransforms, in JSON or Protobuf.
+"""Foxglove's messages LaserScan, PointCloud, PoseInFrame and FrameTransforms, in JSON or Protobuf.
 
-Schemas: https://docs.foxglove.dev/docs/sdk/schemas. The records are those of JSON; what Protobuf parses has the
-same attributes.
+Schemas: https://docs.foxglove.dev/docs/sdk/schemas. The records are those of JSON; messages parsed by Protobuf
+have the same attributes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class _Stamp(Struct, frozen=True):
 
 
 class _Vector(Struct, frozen=True):
-    """Meters, or with w a quaternion, all zero where it was left out."""
+    """Meters, or with w a quaternion; zero if it is missing."""
 
     x: float = 0.0
     y: float = 0.0
@@ -43,7 +43,7 @@ class _Pose(Struct, frozen=True):
 
 
 class _LaserScan(Struct, frozen=True):
-    """A foxglove.LaserScan; a range that is null is no number."""
+    """A foxglove.LaserScan; a range of null is NaN."""
 
     ranges: list[float | None]
     start_angle: float
@@ -60,7 +60,7 @@ class _PackedField(Struct, frozen=True):
 
 
 class _PointCloud(Struct, frozen=True):
-    """A foxglove.PointCloud; ``data`` comes in base64."""
+    """A foxglove.PointCloud; ``data`` is base64."""
 
     point_stride: int
     fields: list[_PackedField]
@@ -89,7 +89,7 @@ class _FrameTransforms(Struct, frozen=True):
 
 
 def laser_scan(message: _LaserScan) -> Sensed:
-    """The scan, without range limits and times, which Foxglove lacks."""
+    """The message as a sensor_msgs/LaserScan, without range limits and times, which Foxglove lacks."""
     with np.errstate(over="ignore", invalid="ignore"):
         ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
     step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
@@ -99,7 +99,7 @@ def laser_scan(message: _LaserScan) -> Sensed:
 
 
 def point_cloud(message: _PointCloud) -> Sensed:
-    """The cloud, its number types in the codes of sensor_msgs/PointField; little endian."""
+    """The message as a sensor_msgs/PointCloud2, little endian."""
     stride = message.point_stride
     if not stride:
         raise MalformedMessageError("point_stride is zero")
@@ -110,7 +110,7 @@ def point_cloud(message: _PointCloud) -> Sensed:
 
 
 def _sensed(message: _LaserScan | _PointCloud, type_name: str, *parts: Any) -> Sensed:
-    """A message of sensor_msgs with these parts behind its header."""
+    """A message of sensor_msgs with these fields after its header."""
     T = _pose(message.pose.position, message.pose.orientation, 3)
     head = header(_stamp_ns(message.timestamp), message.frame_id)
     return Sensed(new(type_name, head, *parts), None if np.array_equal(T, np.eye(4)) else T)
@@ -123,7 +123,7 @@ def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
 
 
 def frame_transform(message: _FrameTransform, link: Frames | None = None, dimension: int = 3) -> list[StampedPose]:
-    """A foxglove.FrameTransform, or none where it is not between these two frames; flattened for dimension 2."""
+    """A foxglove.FrameTransform, flattened for dimension 2; none if it is not between the frames of ``link``."""
     frames = frame_name(message.parent_frame_id), frame_name(message.child_frame_id)
     if link not in (None, frames):
         return []
@@ -132,7 +132,7 @@ def frame_transform(message: _FrameTransform, link: Frames | None = None, dimens
 
 
 def frame_transforms(message: _FrameTransforms, **chosen: Any) -> list[StampedPose]:
-    """All transforms of a foxglove.FrameTransforms, or those chosen as above."""
+    """All transforms of a foxglove.FrameTransforms, or those between the frames of ``link``."""
     return [transform for each in message.transforms for transform in frame_transform(each, **chosen)]
 
 
@@ -141,27 +141,27 @@ def _stamp_ns(stamp: _Stamp) -> int:
 
 
 def _pose(position: _Vector, orientation: _Vector, dimension: int) -> Pose:
-    """A pose; a quaternion that was left out, zero, turns nothing."""
+    """A pose; a missing quaternion, which is zero, counts as the identity."""
     is_given = any((orientation.x, orientation.y, orientation.z, orientation.w))
     return pose_of(position, orientation if is_given else _Vector(w=1.0), dimension)
 
 
 def parse_json(data: memoryview, record: type[Struct]) -> Any:
-    """A record of this type. NaN and Infinity, which are no JSON but which Python writes, are taken."""
+    """A record of this type; NaN and Infinity, which Python writes although JSON has none, are accepted."""
     try:
         return msgspec.json.decode(data, type=record)
     except msgspec.ValidationError as error:
-        raise MalformedMessageError(f"it does not fit its type: {error}") from error
+        raise MalformedMessageError(f"it does not match its type: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError):
         pass
     try:
         return msgspec.convert(json.loads(bytes(data)), record)
     except (ValueError, RecursionError) as error:
-        raise MalformedMessageError(f"it is no JSON of its type: {error}") from error
+        raise MalformedMessageError(f"it is not JSON of its type: {error}") from error
 
 
 def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:
-    """Parser of a channel's messages; one without a usable schema raises at every message."""
+    """Parser of a channel's messages; without a usable schema it raises at every message."""
     from google.protobuf.message import DecodeError
     from mcap.exceptions import McapError
     from mcap.records import Schema
@@ -180,6 +180,6 @@ def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:
         try:
             return decode(bytes(data))
         except DecodeError as error:
-            raise MalformedMessageError(f"it is no Protobuf of its schema: {error}") from error
+            raise MalformedMessageError(f"it is not Protobuf of its schema: {error}") from error
 
     return parse

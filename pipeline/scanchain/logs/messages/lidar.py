@@ -1,4 +1,4 @@
-"""Messages of lidars to the points that came back: laser scans in the plane, clouds in space."""
+"""Messages of lidars to their valid returns: planar laser scans, and clouds."""
 
 from __future__ import annotations
 
@@ -26,37 +26,32 @@ from scanchain.logs.messages.ros import (
     stamp_ns,
 )
 
-_NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
-_MOST_GEOMETRIES = 16
-_MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; in degrees they seem to cover more
-_FARTHEST_M = float(np.finfo(np.float32).max)
-_MOST_STEP = (1 << 31) - 1
-_PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
-_FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, and in all, that show a plane
-
+_NEAREST_M, _FARTHEST_M = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)  # of any range
+_MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; above it angles are in degrees
+_PLANAR_M = 5e-4  # largest distance of a point from the plane of a planar cloud: rounding of float32
 _LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
 _LIVOX_FIELDS = (("offset_time", 0, 6), ("x", 4, 7), ("y", 8, 7), ("z", 12, 7))
 
 
 class Sensed(NamedTuple):
-    """A LaserScan or PointCloud2 of sensor_msgs; pose (4, 4) of its points in its frame, None for its origin."""
+    """A sensor_msgs/LaserScan or PointCloud2; pose (4, 4) of its points in its frame, None for the identity."""
 
     message: Any
     T_frame_points: Pose | None = None
 
 
 def read_multi_echo_scan(message: Any) -> Sensed:
-    """A sensor_msgs/MultiEchoLaserScan as the scan of each beam's first echo, inf where there is none."""
+    """A sensor_msgs/MultiEchoLaserScan as a scan of the first echo of each beam, inf if there is none."""
     firsts_m = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges]
     message.ranges = np.array(firsts_m, np.float32)
     return Sensed(message)
 
 
 def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], config: LogConfig) -> Returns:
-    """Points of the beams that came back: finite, at least range_min, below range_max.
+    """Valid returns of a laser scan: finite, at least range_min, below range_max.
 
-    Scanners write range_max, or more, for a beam without return, and zero for an invalid one; limits that are
-    not positive are taken as unknown. Negative angle increments are as good as positive ones.
+    Scanners report range_max or more for a beam without return, and zero for an invalid one; limits that are not
+    positive count as unknown. Angle increments may be negative.
     """
     message, T_frame_points = read(data)
     ranges_m = message.ranges
@@ -78,12 +73,12 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
     return Returns(stamp_ns(message), points, times_s, count, why, frame_of(message), stated)
 
 
-@lru_cache(_MOST_GEOMETRIES)
+@lru_cache(16)  # few scanners have more than one geometry
 def _directions(first_rad: float, step_rad: float, count: int) -> NDArray[np.float32]:
     """Directions (N, 2) of the beams."""
     if not isfinite(first_rad + step_rad * count):
         raise MalformedMessageError(
-            f"its beams lie {step_rad:g} rad apart from {first_rad:g} rad on, which cannot be"
+            f"its beams begin at {first_rad:g} rad and are {step_rad:g} rad apart, which is impossible"
         )
     turns = abs(step_rad) * count / (2.0 * np.pi)
     if turns > _MOST_TURNS:
@@ -95,13 +90,13 @@ def _directions(first_rad: float, step_rad: float, count: int) -> NDArray[np.flo
 
 
 def read_livox(data: memoryview, encoding: str) -> Sensed:
-    """A Livox driver's CustomMsg, the points a view of it, each a row of its own as CDR aligns them."""
+    """A Livox driver's CustomMsg as a cloud that is a view of it, one point per row as CDR aligns points."""
     is_ros1 = encoding == "ros1"
     order = "<" if is_ros1 or data[1:2] == b"\1" else ">"
     try:
         seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
         frame = str(data[16 : 16 + length], "utf-8", "replace").rstrip("\0")
-        begin = 16 + length  # behind it the time of the first point by the lidar's clock, aligned to 8 bytes
+        begin = 16 + length  # followed by the time of the first point by the lidar's clock, aligned to 8 bytes
         begin += 0 if is_ros1 else (4 - begin) % 8
         (count,) = struct.unpack_from(f"{order}I", data, begin + 16)
     except struct.error as error:
@@ -117,25 +112,25 @@ def read_livox(data: memoryview, encoding: str) -> Sensed:
 def decode_cloud(
     data: memoryview, read: Callable[[memoryview], Sensed], times: PointTimes, plane_m: float | None = None
 ) -> Returns:
-    """Points that came back: finite, not the origin, within the limits; their times with them.
+    """Valid returns of a cloud, with their times: finite, not the origin, within the limits.
 
-    Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
+    Rows may be padded, bytes in either order, x y z of any number type; other fields are ignored.
 
-    plane_m : height of the plane of a planar scanner, whose points (N, 2) are those in the plane
-    Raises MalformedMessageError, also where a point is not in the plane of the others.
+    plane_m : height of the plane of a planar scanner, whose points are (N, 2)
+    Raises MalformedMessageError, also if a point is outside of that plane.
     """
     message, T_frame_points = read(data)
     point = _layout(message, times)
     cloud = _rows(message, point)
     points = np.empty((len(cloud), 3), np.float32)
-    kept = np.empty(len(cloud), np.int32)
+    valid = np.empty(len(cloud), np.int32)
     x, y, z = (_as_float32(cloud[name]) for name in "xyz")
     low_m, high_m = times.config.min_range_m, times.config.max_range_m
-    high_square = min(high_m * high_m, _FARTHEST_M)  # where float32 ends
-    count = keep_valid(x, y, z, low_m**2, high_square, points, kept)
+    high_square = min(high_m * high_m, _FARTHEST_M)
+    count = keep_valid(x, y, z, low_m**2, high_square, points, valid)
     times_s, stated = NO_TIMES, None
     for name in (point.names or ())[3:] if count else ():
-        values = cloud[name] if count == len(cloud) else cloud[name][kept[:count]]
+        values = cloud[name] if count == len(cloud) else cloud[name][valid[:count]]
         stated = times.from_field(name, stamp_ns(message), values)
         times_s = stated.seconds(stamp_ns(message)) if stated.span else NO_TIMES
     if times.by_azimuth:
@@ -154,7 +149,7 @@ def decode_cloud(
 
 
 def plane_height_m(clouds: Iterable[Returns]) -> float | None:
-    """The common height of all points of the first clouds, None without one or with too few points."""
+    """Height of the plane that contains all points of the first clouds; None if there is none, or few points."""
     heights_m = np.empty(0, np.float32)
     most = 0
     for cloud in clouds:
@@ -162,13 +157,13 @@ def plane_height_m(clouds: Iterable[Returns]) -> float | None:
         heights_m = np.concatenate([heights_m, cloud.points[:, 2]])
         if len(heights_m) and np.ptp(heights_m) > 2.0 * _PLANAR_M:
             return None
-        if len(heights_m) > _ENOUGH_POINTS:
+        if len(heights_m) > 1000:
             break
-    return None if most < _FEWEST_POINTS else float(np.median(heights_m))
+    return float(np.median(heights_m)) if most >= 3 else None  # three points define a plane
 
 
 def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
-    """The field itself where it is native float32 already, else a copy; infinite where float32 ends."""
+    """The field itself if it is native float32, else a copy; infinite beyond the range of float32."""
     if values.dtype == np.float32 and values.dtype.isnative and values.flags.aligned:
         return values.view(np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -177,8 +172,8 @@ def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
 
 def _layout(message: Any, times: PointTimes) -> np.dtype[np.void]:
     """A point as a structured type: x, y, z and the time field, if any."""
-    if message.point_step > _MOST_STEP:
-        raise MalformedMessageError(f"point_step {message.point_step} is more than a point can have")
+    if message.point_step >= 1 << 31:
+        raise MalformedMessageError(f"point_step {message.point_step} is too large for a point")
     fields = {field.name: field for field in message.fields}
     if missing := [name for name in "xyz" if name not in fields]:
         raise MalformedMessageError(
@@ -189,7 +184,7 @@ def _layout(message: Any, times: PointTimes) -> np.dtype[np.void]:
     for name in chosen:
         field = fields[name]
         if field.datatype not in NUMBERS:
-            raise MalformedMessageError(f"field {name} has data type {field.datatype}; PointField has 1 to 8")
+            raise MalformedMessageError(f"field {name} has data type {field.datatype}; PointField defines 1 to 8")
         numbers.append(np.dtype((">" if message.is_bigendian else "<") + NUMBERS[field.datatype]))
         end = field.offset + numbers[-1].itemsize
         if end > message.point_step:
@@ -201,7 +196,7 @@ def _layout(message: Any, times: PointTimes) -> np.dtype[np.void]:
 
 
 def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:
-    """All points of all rows, the padding behind each row left out."""
+    """All points of all rows, without the padding after each row."""
     height, width, body = message.height, message.width, message.data
     row = width * point.itemsize
     stride = message.row_step if height > 1 else row
@@ -219,13 +214,13 @@ def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:
 
 
 def moved(points: RawPoints, T: Pose | None) -> RawPoints:
-    """Points (N, d) moved by a pose (4, 4); None moves nothing."""
+    """Points (N, d) transformed by a pose (4, 4); None is the identity."""
     d = points.shape[1]
     return points if T is None else (points @ T[:d, :d].T + T[:d, 3]).astype(np.float32)
 
 
 def _why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
-    """Reason why none of the ranges (N,) is a return between these limits."""
+    """Reason why none of the ranges (N,) is a return between the limits, as text."""
     undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
     near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
     far_m = ranges_m[np.isfinite(ranges_m) & (ranges_m >= high_m)]

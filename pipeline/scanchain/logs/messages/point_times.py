@@ -1,4 +1,4 @@
-"""Times of the points of scans, whatever a driver's name and unit for them, and what refutes them."""
+"""Times of the points of scans: their field, unit and origin, and the correction of wrong ones."""
 
 from __future__ import annotations
 
@@ -27,38 +27,41 @@ UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO, _AT_ONCE = "no point times", "every scan counts as measured at once"
 UNTIMED = f"{_NO}: {_AT_ONCE}"
 _STAMP, _EPOCH, _CLOCK = "after the stamp", "since the epoch", "of another clock, counted from the first point"
-_SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are micro- or milliseconds
-_LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
-_NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
-_ABSOLUTE_S = 3600.0  # least absolute time in seconds
-_CORE = 0.7  # share of a scan's times, the densest, that tells its span: so many are right
-_SAMPLE = np.sort(np.random.default_rng(0).random(512))  # places, 0 to 1, of times whose quantiles are taken
+# unit and origin of the times of one message
+_SHORTEST_SCAN_NS = 500_000  # shortest span of a scan: integers with a smaller one are micro- or milliseconds
+_LONGEST_SCAN = 1e4  # longest span in milliseconds: floats with a larger one are micro- or nanoseconds
+_NEAR_S = 1.0  # longest time between the stamp of a scan and its beginning
+_ABSOLUTE_S = 3600.0  # smallest time that can be absolute, as it may also count from the stamp
+_CORE = 0.7  # share of correct times assumed in a scan: the span of its densest part is not affected by the others
+_SAMPLE = np.sort(np.random.default_rng(0).random(512))  # positions, 0 to 1, of the times that are sampled
 
-_BEFORE, _AFTER = 12, 3  # scans before and after a scan that are its neighbors
-_SHORT, _LONG = 0.9, 1.2  # shares of the usual span, or of the period, that agree with it
-_DENSE = 0.85  # least share of its core in the span of a sweep that is dense from end to end
-_LONGEST, _MOST_PERIODS = 2.5, 10.0  # usual spans of a dense sweep, periods of any, not of a sliding window either
-_STEP = 0.25  # of the usual span: a larger step back from point to point begins a row, or a counter anew
-_PART_OF_TURN = 0.6  # least share of a turn's time that the beams of one take
-_SPANS = 100  # number of first scans whose point times are compared with the period
-_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
+# comparison with the neighboring scans and the period; chosen with the drivers of tests/logs/test_point_times.py
+_BEFORE, _AFTER = 12, 3  # number of neighbors before and after a scan
+_SHORT, _LONG = 0.9, 1.2  # limits of a span as a share of the usual span or of the period
+_DENSE = 0.85  # smallest share of the core in the span of a sweep without outliers
+_LONGEST, _MOST_PERIODS = 2.5, 10.0  # longest sweep without outliers in usual spans, and any sweep in periods
+_STEP = 0.25  # share of the usual span above which a step back starts a row, or is a reset of the counter
+_PART_OF_TURN = 0.6  # smallest share of the time of a turn that its beams take
+_SPANS = 100  # number of first scans whose spans are compared with the period
+_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # limits of a span as a share of the period: outside, the unit is wrong
 
 _LEFT_OUT = "contradict the others: these points are left out"
-_UNWRAPPED = "fall back where a counter wrapped or was reset: repaired"
+_UNWRAPPED = "step back where a counter wrapped or was reset: repaired"
 _ALL_SAME = "are constant: matched without them"
 _ZERO = "are zero: matched without them"
-_REFUTED = "contradict the period or the scans around: matched without them"
+_REFUTED = "contradict the period or the neighboring scans: matched without them"
 _NO_SCAN_TIME = "agree with the period, but not with scan_time, which is ignored"
 
-_Judged = tuple[NDArray[np.float32], str, str]  # times (N,), what was done to them and by which values
+_Judged = tuple[NDArray[np.float32], str, str]  # times (N,), their treatment, and the values that were the reason
 
 
 class Field(NamedTuple):
-    """Times of a cloud's points: ``values`` (N,) as in the message, of the type ``kind`` there.
+    """Times of a cloud's points.
 
-    low : the least, but for some that lie farther below most than these spread
-    span : of all, infinite where one is not finite; core : the same by the densest part
-    unit, origin : by the message alone
+    values : (N,) as in the message, of the type ``kind`` there
+    low : the smallest without outliers
+    span : of all values, infinite if one is not finite; core : by the densest part of them
+    unit, origin : inferred from the message alone
     """
 
     name: str
@@ -71,7 +74,7 @@ class Field(NamedTuple):
     origin: str = ""
 
     def seconds(self, stamp_ns: int) -> NDArray[np.float32]:
-        """Times (N,) after the stamp by unit and origin."""
+        """Times (N,) after the stamp, by unit and origin."""
         unit_s, zero = UNITS_S[self.unit], self.low if self.origin == _CLOCK else 0
         if self.origin == _EPOCH:
             zero = _in_units(stamp_ns, unit_s, is_whole=self.values.dtype.kind == "i")
@@ -80,8 +83,8 @@ class Field(NamedTuple):
             values = self.values - zero if zero else self.values
             return np.multiply(values, unit_s, out=times_s, dtype=np.float64, casting="unsafe")
 
-    def taken_as(self, unit: str, stamp_ns: int) -> Field:
-        """The same in a unit, with the origin that its values suggest then."""
+    def in_unit(self, unit: str, stamp_ns: int) -> Field:
+        """The field with another unit, and the origin that its values then suggest."""
         unit_s, origin = UNITS_S[unit], _STAMP
         after = float(self.low) - float(_in_units(stamp_ns, unit_s, is_whole=self.values.dtype.kind == "i"))
         if abs(after) * unit_s < _NEAR_S and self.low * unit_s > _ABSOLUTE_S:
@@ -91,14 +94,14 @@ class Field(NamedTuple):
         return self._replace(unit=unit, origin=origin)
 
     def steps_back(self, least_s: float) -> NDArray[np.int64 | np.float64]:
-        """Steps (N - 1,) from point to point, 0 but for those that fall back so far."""
+        """Steps (N - 1,) from point to point that go back by more than ``least_s``; 0 for all others."""
         with np.errstate(over="ignore", invalid="ignore"):
             steps = np.diff(self.values)
         return np.where(steps < -least_s / UNITS_S[self.unit], steps, 0)
 
 
 class Beams(NamedTuple):
-    """Times of a laser scan's beams: ``numbers`` (N,) came back, of so many, which cover so many turns."""
+    """Times of a laser scan's beams; ``numbers`` (N,) are those of the valid returns."""
 
     numbers: NDArray[np.intp]
     beams: int
@@ -107,17 +110,18 @@ class Beams(NamedTuple):
     scan_time_s: float
 
     def seconds(self, increment_s: float) -> NDArray[np.float32]:
-        """Times (N,) after the stamp; (0,) where the beams are simultaneous."""
+        """Times (N,) after the stamp; (0,) if the beams are simultaneous."""
         with np.errstate(over="ignore", invalid="ignore"):
             return (increment_s * self.numbers).astype(np.float32) if increment_s else NO_TIMES
 
 
 class Returns(NamedTuple):
-    """The valid returns of one scan message.
+    """The valid returns of one message.
 
-    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,), by the message
-    alone, which has them as ``stated``; ``dropped`` counts what was left out, ``why`` is the reason where nothing
-    is left; ``frame`` is that of the points.
+    points : (N, d) float32 meters, in ``frame``
+    times_s : (N,) float32 seconds after ``stamp_ns``, or (0,); inferred from the message alone
+    dropped : number of invalid returns; why : reason if no return is valid
+    stated : times as in the message
     """
 
     stamp_ns: int
@@ -129,25 +133,25 @@ class Returns(NamedTuple):
     stated: Field | Beams | None = None
 
     def seconds(self, unit: str) -> NDArray[np.float32]:
-        """Times (N,) after the stamp as stated, if in this unit; (0,) where they are not, or constant."""
+        """Stated times (N,) after the stamp in this unit; (0,) if there are none or they are constant."""
         if isinstance(self.stated, Beams):
             return self.stated.seconds(UNITS_S[unit] * self.stated.increment_s)
         if self.stated is None or not self.stated.span:
             return NO_TIMES
-        return self.stated.taken_as(unit, self.stamp_ns).seconds(self.stamp_ns)
+        return self.stated.in_unit(unit, self.stamp_ns).seconds(self.stamp_ns)
 
 
 class PointTimes:
-    """Seconds after the stamp for the points of scans.
+    """Reader of point times, as seconds after the stamp.
 
-    ``from_field`` reads them of each message alone, in any order and from any thread: the unit is that of
-    ``log.point_times`` or, where that is ``auto``, the one that the values suggest. ``judged`` then repairs what
-    the sweep's own majority, the period or the neighboring sweeps refute where a counter wrapped or was reset,
-    else these points are left out; a sweep whose times are beyond repair has none afterwards.
+    ``from_field`` reads the times of each message alone, in any order and from any thread, in the unit of
+    ``log.point_times`` or, if that is ``auto``, in the one suggested by the values. ``checked`` compares them with
+    the majority in the sweep, the period and the neighboring sweeps: times after a wrap or reset of a counter are
+    repaired, points with other wrong times removed, and all times of a sweep with mostly wrong ones ignored.
 
-    fields : names of those that hold times, the likeliest first
-    assumed : how they are taken by one of the first scans that have times, empty where that needs no note
-    spans_s, periods_s : time that sweeps usually take, and from one to the next, at each of them
+    fields : names of fields with times, the most likely first
+    assumed : note on the assumed unit and origin, from one of the first scans with times; empty if needless
+    spans_s, periods_s : usual duration of sweeps and time between them, at each sweep
     """
 
     def __init__(self, config: LogConfig) -> None:
@@ -162,15 +166,15 @@ class PointTimes:
         self.spans_s: list[float] = []
         self.periods_s: list[float] = []
         self._number = self._counted = 0
-        self._tallies: dict[str, list[tuple[str, int]]] = {}  # of what was done: the scan and its points
+        self._tallies: dict[str, list[tuple[str, int]]] = {}  # by treatment: the scans and numbers of points
 
     def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> Field:
-        """Raw values (N,), N > 0, with the unit and the origin that most of them suggest.
+        """Values (N,), N > 0, of a field, with the unit and the origin that most of them suggest.
 
-        Whole numbers are nanoseconds, or the next unit, micro- or milliseconds, in which the whole scan is not
-        shorter than half a millisecond. Floats are seconds where they span up to 10, else milli-, micro- or
-        nanoseconds by their span. Values within a second of the stamp are absolute, others count from it; those of
-        another clock, the sensor's own or one that is off by the leap seconds, count from the first point.
+        Integers are in the smallest unit, nano-, micro- or milliseconds, in which the scan lasts at least half a
+        millisecond. Floats with a span up to 10 are seconds, others milli-, micro- or nanoseconds by their span.
+        Values within a second of the stamp are absolute, others count from it; those of another clock (that of the
+        sensor, or one that is off by leap seconds) count from the first point.
         """
         is_whole, kind = values.dtype.kind in "iu", values.dtype.name
         values = values.astype(np.int64 if is_whole else np.float64)
@@ -189,16 +193,16 @@ class PointTimes:
             if float(first) < begin - core:
                 low = values.min(where=values >= begin - core, initial=values.max())
         unit = self.unit or _likely_unit(core, is_whole=is_whole)
-        field = Field(name, kind, values, low, span, core).taken_as(unit, stamp_ns)
+        field = Field(name, kind, values, low, span, core).in_unit(unit, stamp_ns)
         if core > 0.0 and self.assumed.startswith(_NO):
-            self.assumed = _taken(field)
+            self.assumed = _assumed(field)
         elif self.assumed == UNTIMED and span == 0.0 and len(values) > 1:  # as a float32 holds absolute times
-            self.assumed = f"{_NO}: field {name} ({kind}) is there and constant ({first:.10g}); {_AT_ONCE}"
+            self.assumed = f"{_NO}: field {name} ({kind}) is constant ({first:.10g}); {_AT_ONCE}"
         return field
 
-    def judged(self, messages: Iterable[Decoded], topic: str) -> Iterator[Decoded]:
-        """The messages in their order, the topic's scans with times that hold."""
-        waiting, behind, ahead = deque[Decoded](), deque[Returns](maxlen=_BEFORE), deque[Returns]()
+    def checked(self, messages: Iterable[Decoded], topic: str) -> Iterator[Decoded]:
+        """Messages in their order, the scans of the topic with checked times."""
+        waiting, before, ahead = deque[Decoded](), deque[Returns](maxlen=_BEFORE), deque[Returns]()
         for message in chain(messages, [None]):
             if message is not None:
                 waiting.append(message)
@@ -210,33 +214,33 @@ class PointTimes:
                 first = waiting.popleft()
                 if ahead and first.value is ahead[0]:
                     frame = ahead[0].frame
-                    around = [each for each in (*behind, *ahead) if len(each.points) and each.frame == frame]
-                    first = first._replace(value=self._judge(ahead[0], around))
-                    behind.append(ahead.popleft())
+                    around = [each for each in (*before, *ahead) if len(each.points) and each.frame == frame]
+                    first = first._replace(value=self._check(ahead[0], around))
+                    before.append(ahead.popleft())
                 self._number += first.channel.topic == topic
                 yield first
 
     def faults(self, topic: str) -> list[str]:
-        """Times that were repaired, ignored or left out, and how many."""
+        """Lines on the numbers of times repaired, ignored or left out."""
         lines, scans = [], f"{counted(self._counted, 'scan')} of {topic}"
-        for done, those in self._tallies.items():
-            points = sum(points for _, points in those)
-            many = f"{counted(points, 'point')} in {len(those)}" if points else f"{len(those)}"
-            if done not in (_ZERO, _ALL_SAME) or len(those) < self._counted:  # else the note is of all
-                lines.append(f"times of {many} of {scans} {done} (the first: {those[0][0]})")
+        for done, scans_done in self._tallies.items():
+            points = sum(points for _, points in scans_done)
+            many = f"{counted(points, 'point')} in {len(scans_done)}" if points else f"{len(scans_done)}"
+            if done not in (_ZERO, _ALL_SAME) or len(scans_done) < self._counted:  # all are in the note
+                lines.append(f"times of {many} of {scans} {done} (the first: {scans_done[0][0]})")
         return lines
 
     def warnings(self, topic: str) -> list[str]:
-        """A line where the sweeps' times are of another unit by the period."""
+        """Warning if by the period the times of sweeps are in another unit."""
         span_s, period_s = (median_low(each[:_SPANS] or [0.0]) for each in (self.spans_s, self.periods_s))
         if not span_s or not period_s or _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
             return []
         return [
             f"by their point times scans of {topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} of the "
-            "period: of another unit? scanchain doctor names the flag, --preprocess.deskew false ignores them"
+            "period: is the unit wrong? scanchain doctor names the flag, --preprocess.deskew false ignores them"
         ]
 
-    def _judge(self, returns: Returns, around: Sequence[Returns]) -> Returns:
+    def _check(self, returns: Returns, around: Sequence[Returns]) -> Returns:
         times_s, points, done, seen = returns.times_s, returns.points, "", ""
         if not len(points):
             return returns
@@ -245,8 +249,8 @@ class PointTimes:
         elif returns.stated is not None:
             times_s, done, seen = self._of_field(returns, returns.stated, around)
         if done == _LEFT_OUT:
-            kept = np.isfinite(times_s)
-            times_s, points = times_s[kept], points[kept]
+            is_valid = np.isfinite(times_s)
+            times_s, points = times_s[is_valid], points[is_valid]
         if len(times_s) and not (farthest_s := largest_magnitude(times_s)) <= LONGEST_SWEEP_S:
             points, times_s, done = returns.points, NO_TIMES, _REFUTED
             seen = f"a point {farthest_s:.3g} s from the stamp"
@@ -258,7 +262,7 @@ class PointTimes:
         return returns._replace(points=points, times_s=times_s, dropped=returns.dropped + left, stated=None)
 
     def _of_beams(self, beams: Beams, around: Sequence[Returns]) -> _Judged:
-        """Times of a laser scan whose ``time_increment`` agrees with the period or ``scan_time``, or is alone."""
+        """Times of a laser scan if ``time_increment`` agrees with the period or ``scan_time``, or has neither."""
         if beams.increment_s == 0.0:
             return NO_TIMES, _ZERO, "time_increment"
         steps_s, turns = _steps_s(around), min(beams.turns, 1.0)
@@ -278,7 +282,7 @@ class PointTimes:
         return NO_TIMES, _REFUTED, f"{seen}, period {period_s:.3g} s"
 
     def _of_field(self, returns: Returns, field: Field, around: Sequence[Returns]) -> _Judged:
-        """Times of a cloud by its neighbors, its own majority and the period; NaN where they are refuted."""
+        """Times of a cloud checked by its neighbors, its majority and the period; NaN for wrong ones."""
         if not field.core > 0.0:
             return NO_TIMES, _ALL_SAME, f"field {field.name}"
         fields = [each.stated for each in around if isinstance(each.stated, Field) and each.stated.core > 0.0]
@@ -290,7 +294,7 @@ class PointTimes:
         if is_running or unit != field.unit:
             field = field._replace(unit=unit, origin=_CLOCK if is_running else field.origin)
             times_s = field.seconds(returns.stamp_ns)
-        self.assumed = self.assumed if self.spans_s else _taken(field)
+        self.assumed = self.assumed if self.spans_s else _assumed(field)
         self.spans_s.append(usual_s)
         self.periods_s.append(period_s)
         seen = f"{field.span * unit_s:.3g} s, usually {usual_s:.3g} s, period {period_s:.3g} s"
@@ -301,20 +305,20 @@ class PointTimes:
         low_s = median_low(lows_s or [0.0])
         if not _SHORT * usual_s <= field.span * unit_s <= _LONG * usual_s:
             usual_back = int(np.count_nonzero(regular[0].steps_back(_STEP * usual_s))) if regular else 0
-            return *_mended(field, times_s, usual_s, low_s, usual_back), seen
+            return *_repaired(field, times_s, usual_s, low_s, usual_back), seen
         if lows_s and abs(off_s := unit_s * float(field.low) - low_s) > 0.5 * usual_s:
             return NO_TIMES, _REFUTED, f"begins {off_s:+.3g} s from there"
         return times_s, "", seen
 
 
 def from_azimuth(points: RawPoints, config: LogConfig) -> NDArray[np.float32]:
-    """Times (N,) of points (N, d) by the lidar's turn since its start, which is at the stamp."""
+    """Times (N,) of points (N, d) by the azimuth from that of the lidar at the stamp."""
     sense = -1.0 if config.point_times == "clockwise" else 1.0
     turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
     return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
 
 
-def _taken(field: Field) -> str:
+def _assumed(field: Field) -> str:
     return f"point times: field {field.name} ({field.kind}) taken as {field.unit} {field.origin} (log.point_times)"
 
 
@@ -334,29 +338,29 @@ def _likely_unit(span: float, *, is_whole: bool) -> str:
 
 
 def _steps_s(around: Sequence[Returns]) -> list[float]:
-    """Times from scan to scan by their stamps, 0 where one goes back or is alone."""
+    """Times from scan to scan by their stamps, 0 for a step back or a single scan."""
     return [max(1e-9 * (after.stamp_ns - before.stamp_ns), 0.0) for before, after in pairwise(around)] or [0.0]
 
 
 def _fits(whole_s: float, turn_s: float, turns: float) -> bool:
-    """True of the time of all beams where a lidar turns once in ``turn_s`` and they cover so much of a turn."""
+    """True if beams that cover ``turns`` turns of ``turn_s`` each can take ``whole_s``."""
     return _PART_OF_TURN * turns * turn_s <= whole_s <= _LONG * turn_s < inf
 
 
 def _usual_span_s(fields: Sequence[Field], unit_s: float, period_s: float) -> float:
-    """Time that sweeps take by their extremes, or by most of their points where the period refutes these."""
+    """Usual duration of sweeps: their span, or that of most points if the period contradicts the span."""
     span_s = unit_s * median_low([each.span for each in fields])
     core_s = unit_s * median_low([each.core for each in fields])
     is_confirmed = core_s >= _DENSE * span_s or span_s <= (_LONG * period_s or 3.0 * core_s)
     return span_s if is_confirmed else max(period_s, core_s)
 
 
-def _mended(
+def _repaired(
     field: Field, times_s: NDArray[np.float32], usual_s: float, low_s: float, usual_back: int
 ) -> tuple[NDArray[np.float32], str]:
-    """Times of a sweep that lasts longer or shorter than usual, NaN where they are refuted, and what was done.
+    """Times of a sweep that is longer or shorter than usual, NaN for wrong ones, and their treatment.
 
-    low_s : usual time of the first point; usual_back : steps back in a sweep, 0 in the order of firing
+    low_s : usual time of the first point; usual_back : usual number of steps back, 0 in the order of firing
     """
     unit_s, span_s = UNITS_S[field.unit], field.span * UNITS_S[field.unit]
     steps = field.steps_back(_STEP * usual_s)
@@ -371,8 +375,8 @@ def _mended(
         return times_s, ""
     order, most_s = np.sort(times_s[np.isfinite(times_s)]).astype(np.float64), _LONG * usual_s
     begin_s = order[np.argmax(np.searchsorted(order, order + most_s, "right") - np.arange(len(order)))]
-    is_kept = (times_s >= begin_s) & (times_s <= begin_s + most_s)
-    if 2 * np.count_nonzero(is_kept) <= len(is_kept):
+    is_right = (times_s >= begin_s) & (times_s <= begin_s + most_s)
+    if 2 * np.count_nonzero(is_right) <= len(is_right):
         return NO_TIMES, _REFUTED
-    kept_s = np.where(is_kept, times_s, np.float32(nan))
-    return (kept_s - np.nanmin(kept_s) if field.origin == _CLOCK else kept_s), _LEFT_OUT
+    right_s = np.where(is_right, times_s, np.float32(nan))
+    return (right_s - np.nanmin(right_s) if field.origin == _CLOCK else right_s), _LEFT_OUT

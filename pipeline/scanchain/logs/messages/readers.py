@@ -1,4 +1,4 @@
-"""The table of message types, from which every channel gets the reader of its messages."""
+"""The table of message types: the role of a channel, and the reader of its messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ROS, _FOXGLOVE = ("cdr", "ros1"), ("json", "protobuf")  # encodings
 
 
 Role = Literal["scan", "cloud", "odometry", "pose", "transforms"]  # use of a message type
-_TYPES: dict[str, tuple[Role, Read]] = {  # those of ROS are laid out alike in ROS 1 and 2
+_TYPES: dict[str, tuple[Role, Read]] = {  # ROS 1 and 2 have the same fields
     "sensor_msgs/LaserScan": ("scan", Sensed),
     "sensor_msgs/MultiEchoLaserScan": ("scan", read_multi_echo_scan),
     "foxglove.LaserScan": ("scan", foxglove.laser_scan),
@@ -39,12 +39,12 @@ LIDAR_TYPES = ", ".join(sorted(name for name, (role, _) in _TYPES.items() if rol
 
 
 def kind(channel: Channel) -> str:
-    """Message type as package/Type, whatever form the schema's name has."""
+    """Message type as package/Type, for any form of the schema's name."""
     return channel.type_name.replace("/msg/", "/").replace("::msg::dds_::", "/").rstrip("_")
 
 
 def role(channel: Channel) -> Role | None:
-    """Use of the channel's messages; None for a type or an encoding that is not supported."""
+    """Role of the channel's messages; None for an unsupported type or encoding."""
     name = kind(channel)
     encodings = _FOXGLOVE if name.startswith("foxglove.") else _ROS
     return _TYPES[name][0] if name in _TYPES and channel.encoding in encodings else None
@@ -66,7 +66,7 @@ def has_poses(channel: Channel) -> bool:
 
 
 def reader(channel: Channel) -> Read:
-    """Reader of the messages of a channel that has a role; that of poses takes their ``dimension``, too."""
+    """Reader of the messages of a channel that has a role; readers of poses accept ``dimension``."""
     name, encoding = kind(channel), channel.encoding
     _, read = _TYPES[name]
     if read is read_livox:
@@ -83,7 +83,7 @@ def reader(channel: Channel) -> Read:
 
 
 def pose_reader(channel: Channel, dimension: int, link: Frames | None = None) -> Read:
-    """Reader of the channel's poses, flattened for dimension 2; of transforms, lists of those of the link."""
+    """Reader of the channel's poses, flattened for dimension 2; of transforms, a list of those of the link."""
     chosen = {} if link is None else {"link": link}
     return partial(reader(channel), dimension=dimension, **chosen)
 

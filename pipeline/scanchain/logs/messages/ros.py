@@ -1,4 +1,4 @@
-"""ROS messages, unpacked by rosbags from ROS 2's CDR or ROS 1's packed serialization, and packed in CDR."""
+"""ROS messages, deserialized by rosbags from CDR (ROS 2) or ROS 1, and serialized to CDR."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 class MalformedMessageError(Exception):
-    """A message that contradicts its schema; the text says how."""
+    """A message that contradicts its schema; the text states how."""
 
     def __init__(self, text: str) -> None:
         super().__init__(printable(text))
@@ -20,17 +20,17 @@ class MalformedMessageError(Exception):
 
 @cache
 def typestore(encoding: str = "cdr") -> Any:
-    """The message types of ROS 2, or of ROS 1 for the encoding ``ros1``."""
-    from rosbags.typesys import Stores, get_typestore  # a twentieth of a second
+    """Message types of ROS 2, or of ROS 1 for the encoding ``ros1``."""
+    from rosbags.typesys import Stores, get_typestore  # takes 0.05 s
 
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
-    if encoding == "ros1":  # there it is that of tf2_msgs, which is not of the core
+    if encoding == "ros1":  # which has it outside of the core types
         store.register({_TRANSFORMS: typestore().fielddefs[_TRANSFORMS]})
     return store
 
 
 def unpacked(data: memoryview, type_name: str, encoding: str) -> Any:
-    """A message of a type, pkg/msg/Type; its arrays are views. Raises MalformedMessageError."""
+    """Deserialized message of a type, pkg/msg/Type; its arrays are views. Raises MalformedMessageError."""
     from rosbags.serde import SerdeError
 
     store = typestore(encoding)
@@ -42,7 +42,7 @@ def unpacked(data: memoryview, type_name: str, encoding: str) -> Any:
 
 
 def packed(type_name: str, *fields: Any) -> bytes:
-    """A message of a type, pkg/msg/Type, in CDR."""
+    """Serialized message of a type, pkg/msg/Type, in CDR."""
     return bytes(typestore().serialize_cdr(new(type_name, *fields), type_name))
 
 
@@ -57,12 +57,12 @@ def header(stamp_ns: int, frame: str) -> Any:
 
 
 def point_fields(*layout: tuple[str, int, int]) -> list[Any]:
-    """A sensor_msgs/PointField for each name, offset and type of number."""
+    """A sensor_msgs/PointField for each name, offset and number type."""
     return [new("sensor_msgs/msg/PointField", *each, 1) for each in layout]
 
 
 def frame_name(frame: str) -> str:
-    """The name of a frame, printable, without the slash before it that some of ROS 1 have."""
+    """Printable name of a frame, without the leading slash of some in ROS 1."""
     return printable(frame.lstrip("/"))
 
 

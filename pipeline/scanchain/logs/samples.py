@@ -1,0 +1,127 @@
+"""Samples of the sensors next to the lidar: a stream of the latest ones of each, and the whole ground truth."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right, insort
+from collections.abc import Callable
+from typing import Generic, Protocol, Self, TypeVar
+
+import numpy as np
+
+from scanchain.data import Pose, Trajectory
+from scanchain.errors import counted
+from scanchain.logs.index import Decoded
+from scanchain.logs.messages.poses import StampedPose
+from scanchain.logs.messages.ros import MalformedMessageError
+
+_RETAINED = 512  # samples in memory; a scan is held back for half a second, so this suffices up to 1000 Hz
+NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and that a scan waits for it
+
+
+class Sample(Protocol):
+    """Measurement of a sensor at a stamp."""
+
+    @property
+    def stamp_ns(self) -> int: ...  # noqa: D102
+
+    def interpolate(self, later: Self, stamp_ns: int) -> Self:
+        """The sample at a stamp between this one and a later one."""
+        ...
+
+
+S = TypeVar("S", bound=Sample)
+
+
+class SampleStream(Generic[S]):
+    """The latest samples of one sensor, sorted by stamp."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: list[int] = []
+        self._samples: dict[int, S] = {}
+        self._added_ns = 0  # stamp of the sample added last
+
+    def add(self, sample: S) -> None:
+        """Add a sample; it replaces one of the same stamp. All earlier ones go if the clock jumped back."""
+        if self._stamps_ns and sample.stamp_ns < self._added_ns - NEAREST_NS:
+            self._stamps_ns, self._samples = [], {}
+        self._added_ns = sample.stamp_ns
+        if sample.stamp_ns not in self._samples:
+            insort(self._stamps_ns, sample.stamp_ns)
+        self._samples[sample.stamp_ns] = sample
+        if len(self._stamps_ns) > _RETAINED:
+            del self._samples[self._stamps_ns.pop(0)]
+
+    def covers(self, stamp_ns: int) -> bool:
+        """True if there is a sample at or after a stamp."""
+        return bool(self._stamps_ns) and self._stamps_ns[-1] >= stamp_ns
+
+    def between(self, begin_ns: int, end_ns: int) -> list[S]:
+        """Samples from one stamp to another, both included."""
+        begin, end = bisect_left(self._stamps_ns, begin_ns), bisect_right(self._stamps_ns, end_ns)
+        return [self._samples[stamp_ns] for stamp_ns in self._stamps_ns[begin:end]]
+
+    def at(self, stamp_ns: int) -> S | None:
+        """The sample at a stamp, interpolated between its neighbors or the nearest; None beyond half a second."""
+        if stamp_ns in self._samples:
+            return self._samples[stamp_ns]
+        after = bisect_left(self._stamps_ns, stamp_ns)
+        neighbors = [self._samples[each] for each in self._stamps_ns[max(after - 1, 0) : after + 1]]
+        near = [each for each in neighbors if abs(each.stamp_ns - stamp_ns) <= NEAREST_NS]
+        if len(near) == 2:
+            return near[0].interpolate(near[1], stamp_ns)
+        return near[0] if near else None
+
+
+class Recorded:
+    """Messages of the sensors next to the lidar, sorted by topic; malformed ones are counted.
+
+    streams : those that a scan waits for, by topic
+    truth : poses of the ground truth in the order of the log
+    """
+
+    def __init__(self, odometry_topic: str, ground_truth_topic: str) -> None:
+        self.odometry, self.ground_truth_topic = SampleStream[StampedPose](), ground_truth_topic
+        self.streams = {odometry_topic: self.odometry} if odometry_topic else {}
+        self.truth: list[StampedPose] = []
+        self._moved = ""  # frames of the truth other than the lidar's
+        self._malformed: dict[str, list[str]] = {}  # by topic, the defect of each message
+
+    def add(self, message: Decoded) -> None:
+        """Add the samples of a message to the stream of its topic."""
+        topic = message.channel.topic
+        for sample in message.value if isinstance(message.value, list) else [message.value]:
+            if isinstance(sample, MalformedMessageError):
+                self._malformed.setdefault(topic, []).append(str(sample))
+                continue
+            if topic == self.ground_truth_topic:
+                self.truth.append(sample)
+            if topic in self.streams:
+                self.streams[topic].add(sample)
+
+    def covers(self, stamp_ns: int) -> bool:
+        """True if every stream has a sample at or after a stamp."""
+        return all(stream.covers(stamp_ns) for stream in self.streams.values())
+
+    def ground_truth(self, lidar_on: Callable[[str], Pose]) -> Trajectory | None:
+        """True poses of the lidar so far; None if there are none.
+
+        lidar_on : pose of the lidar in a frame, the identity if the poses of that frame are the lidar's
+        """
+        if not self.truth:
+            return None
+        stamps_ns = np.array([pose.stamp_ns for pose in self.truth], np.int64)
+        T_of = {child: lidar_on(child) for child in {pose.child for pose in self.truth}}
+        self._moved = ", ".join(child for child, T in T_of.items() if not np.array_equal(T, np.eye(len(T))))
+        return Trajectory(stamps_ns, np.array([pose.T_parent_child @ T_of[pose.child] for pose in self.truth]))
+
+    def notes(self) -> list[str]:
+        """Note on a ground truth of another frame than the lidar's."""
+        moved = f"{self.ground_truth_topic}: poses of {self._moved}, moved to the lidar by the transforms"
+        return [moved] if self._moved else []
+
+    def losses(self) -> list[str]:
+        """Warning for each topic with malformed messages."""
+        return [
+            f"{counted(len(reasons), 'malformed message')} of {topic} left out (the first: {reasons[0]})"
+            for topic, reasons in self._malformed.items()
+        ]
