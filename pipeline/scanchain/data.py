@@ -24,6 +24,9 @@ Points = NDArray[np.float64]
 RawPoints = NDArray[np.float32]
 AnyPoints = NDArray[np.floating]  # as arguments, converted where they enter
 Matrix = NDArray[np.float64]
+Vector = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _set = object.__setattr__  # sets a field of a frozen record that checks itself
 _SHOWN = 60  # longest text of a value in the ``repr`` of a record

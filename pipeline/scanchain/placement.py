@@ -236,7 +236,7 @@ class Placement:
         error = lie.log(lie.between(Z_ij, expected))
         chi2_before = float(error @ information @ error)
         joins = self.joined_start < start and closure.target < start <= closure.source
-        self.schedule.note(closure.source, lie.apart(expected, Z_ij)[0], chi2_before, joins=joins)
+        self.schedule.record_closure(closure.source, lie.apart(expected, Z_ij)[0], chi2_before, joins=joins)
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
         if joins:
             self.joined_start = start

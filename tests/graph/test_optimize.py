@@ -9,7 +9,7 @@ from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, expected_ate, pair
 from scanchain.graph.minimizer import Optimizer
-from scanchain.graph.odometry_errors import Explanation, Loosened
+from scanchain.graph.odometry_errors import Explanation, InflatedSegment
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.graphs import BEST, PLAIN, graph_of, published, ring
 from tests.support.naive_graph import normal_equations
@@ -101,7 +101,9 @@ def test_a_fixed_pose_stays_to_the_bit():
 @pytest.mark.parametrize("first", [0, 12, 18, 40, 60])
 def test_edges_added_are_corrected_as_among_all_others(first):
     graph, _ = ring(2, count=60, noise=0.03)
-    graph._explanation = Explanation(np.array([0.02, 0.001]), (Loosened(10, 4, False), Loosened(20, 1, True)))
+    graph._explanation = Explanation(
+        np.array([0.02, 0.001]), (InflatedSegment(10, 4, False), InflatedSegment(20, 1, True))
+    )
     for added, every in zip(graph.added_since(first), (graph.measurements, graph.information), strict=True):
         assert np.allclose(added, every[first:], rtol=1e-12, atol=1e-12)
 

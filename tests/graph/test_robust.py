@@ -198,7 +198,7 @@ def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected(writ
     )
     answer = graph.optimize(GraphConfig(), initialize="odometry")
     assert not answer.rejected.any() and not graph.drift.any()
-    (slip,) = graph.loosened
+    (slip,) = graph.inflated
     assert slip.first < 80 and slip.first + slip.count > 70
     first, last = 10 * slip.first, 10 * (slip.first + slip.count)
     (line,) = graph.corrections(10 * np.arange(len(graph)), "scans")
@@ -217,7 +217,7 @@ def test_loops_that_agree_show_a_jump_of_odometry_among_the_last_poses_instead_o
     assert graph.state().is_rejected.any() and np.abs(graph.poses - true)[1110:, :2, 2].max() > 1.0
     graph.optimize_end(GraphConfig(), 1000, "judge")
     assert not graph.is_rejected.any() and not graph.drift.any()
-    (jump,) = graph.loosened
+    (jump,) = graph.inflated
     edge = jump.first
     assert abs(edge - 1105) <= 1
     assert graph.corrections(10 * np.arange(len(graph)), "scans") == [
@@ -230,7 +230,7 @@ def test_loops_that_agree_show_a_jump_of_odometry_among_the_last_poses_instead_o
 def test_odometry_that_no_loop_contradicts_is_left_as_it_is(first):
     graph, _ = round_trips(lambda i, Z: Z)
     graph.optimize_end(GraphConfig(), first, "judge") if first else graph.optimize(GraphConfig())
-    assert not graph.corrections(np.arange(len(graph))) and graph.loosened == ()
+    assert not graph.corrections(np.arange(len(graph))) and graph.inflated == ()
     assert not graph.drift.any()
 
 
@@ -248,7 +248,7 @@ def test_steps_as_short_as_their_noise_are_no_drift_of_the_scale():
     is_loop = np.arange(len(edges)) >= len(chain)
     graph = graph_of(true, edges, measured, np.diag(sigma**-2), is_loop)
     assert graph.optimize(GraphConfig(), initialize="given").rejected.sum() >= 10
-    assert not graph.drift.any() and not graph.loosened
+    assert not graph.drift.any() and not graph.inflated
 
 
 def extended(graph, whole, count):

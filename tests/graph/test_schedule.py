@@ -46,7 +46,7 @@ class Laps:
         error = lie.log(lie.between(Z, lie.between(T_old, T_new)))
         self.graph.add_edge(target, source, Z, np.diag(SIGMA**-2), is_loop=True)
         chi2 = float((error**2 / SIGMA**2).sum())
-        self.schedule.note(source, float(np.linalg.norm(error[:2])), chi2, **options)
+        self.schedule.record_closure(source, float(np.linalg.norm(error[:2])), chi2, **options)
 
 
 def test_closures_that_fit_wait_until_the_graph_has_grown_by_a_share():
@@ -108,7 +108,7 @@ def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_add
     T_last_new, information = lie.pose_2d(1.0, 0.2, 0.3), np.eye(3)
     graph.add_edge(last, graph.add_pose(before @ T_last_new, 1), T_last_new, information)
     graph.add_edge(0, last, lie.pose_2d(90.0, 0.0, 0.0), information, is_loop=True)
-    graph.take_over(beside.result())
+    graph.adopt(beside.result())
     optimized = whole.optimize(GraphConfig(), initialize="given").state.poses
     assert np.array_equal(graph.poses[:-1], optimized) and not np.allclose(optimized[-1], before)
     assert np.allclose(lie.between(graph.poses[last], graph.poses[-1]), T_last_new, atol=1e-9)

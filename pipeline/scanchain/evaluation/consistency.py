@@ -10,12 +10,11 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Influence, KeyframeErrors, Matrix, Points, Scan, Trajectory
+from scanchain.data import Influence, Integers, KeyframeErrors, Mask, Matrix, Points, Scan, Trajectory, Vector
 from scanchain.errors import InputError
 from scanchain.graph.factors import turns
 from scanchain.graph.pose_graph import PoseGraph
@@ -69,13 +68,13 @@ class ScanPoses(NamedTuple):
     """
 
     poses: Matrix
-    keyframe: NDArray[np.int64]
-    of_keyframes: NDArray[np.int64]
+    keyframe: Integers
+    of_keyframes: Integers
     arms_m: Matrix
     open_motions: Matrix
 
     @classmethod
-    def of(cls, poses: Matrix, of_keyframes: NDArray[np.int64], open_motions: Matrix) -> ScanPoses:
+    def of(cls, poses: Matrix, of_keyframes: Integers, open_motions: Matrix) -> ScanPoses:
         """Each scan is attached to the last keyframe up to it."""
         keyframe = np.searchsorted(of_keyframes, np.arange(len(poses)), side="right") - 1
         positions = poses[:, :-1, -1]
@@ -197,7 +196,7 @@ def with_map_errors(
 
 
 def edge_errors(
-    information: Matrix, is_loop: NDArray[np.bool_], map_errors: Sequence[KeyframeErrors], config: Config,
+    information: Matrix, is_loop: Mask, map_errors: Sequence[KeyframeErrors], config: Config,
     systematic_drift: float = _DRIFT_OF_SYSTEMATIC,
 ) -> tuple[Matrix, Matrix]:  # fmt: skip
     """Covariances (E, k, k) of edges, and the independent one of the later pose of each, by ``with_map_errors``.
@@ -255,18 +254,18 @@ class _Alignment(NamedTuple):
         return errors - np.concatenate([moves, turned], axis=2)
 
 
-def _rms_m(errors: Matrix, d: int) -> NDArray[np.float64]:
+def _rms_m(errors: Matrix, d: int) -> Vector:
     """Root mean squared position error (n,), m, of errors (n, N, k)."""
     return np.sqrt((errors[..., :d] ** 2).sum(axis=2).mean(axis=1))
 
 
-def _expected(ates_m: NDArray[np.float64]) -> ExpectedError:
+def _expected(ates_m: Vector) -> ExpectedError:
     """Mean and bounds of samples."""
     low, high = np.percentile(ates_m, _BOUNDS).tolist()
     return ExpectedError(float(ates_m.mean()), low, high)
 
 
-def _scales(sizes_m: NDArray[np.float64], kinds: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
+def _scales(sizes_m: Vector, kinds: Integers) -> tuple[Vector, float]:
     """(G,) factors on the influences of groups by which their squares sum up to the variance, and its uncertainty.
 
     The variance of the jackknife is (G − 1)/G Σ sᵢ² over the G groups of a kind, of influences sᵢ. It is twice the
@@ -285,7 +284,7 @@ def _scales(sizes_m: NDArray[np.float64], kinds: NDArray[np.int64]) -> tuple[NDA
     return scales, float(1.0 / np.sqrt(2.0 * freedom)) if freedom else 0.0
 
 
-def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> NDArray[np.float64]:
+def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> Vector:
     """(N−1,) ξᵀ Σ⁻¹ ξ / k of the motion between each pose and the next: 1 on average is exact, more overconfident.
 
     poses, reference : (N, d+1, d+1) estimate and truth at the same instants
@@ -304,7 +303,7 @@ def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> NDArra
     return result
 
 
-def disagreement(trajectories: Sequence[Matrix]) -> NDArray[np.float64]:
+def disagreement(trajectories: Sequence[Matrix]) -> Matrix:
     """(M, M) meters: median over the scans of the distance between the motions that two methods find for a scan.
 
     trajectories : M times poses (N, d+1, d+1) of the same scans, (0, d+1, d+1) of a method that has failed
@@ -341,7 +340,7 @@ def sharpness(maps: Sequence[Points]) -> list[Sharpness | None]:
     others at.
     """
     eigenvalues = np.array([_eigenvalues(points) for points in maps])
-    good: NDArray[np.bool_] = np.all(np.isfinite(eigenvalues) & (eigenvalues > 0.0), axis=2)
+    good: Mask = np.all(np.isfinite(eigenvalues) & (eigenvalues > 0.0), axis=2)
     covered = good.sum(axis=1) >= _MIN_COVERAGE * good.sum(axis=1).max(initial=0)
     counts = good[covered].all(axis=0)
     if not counts.any():
@@ -363,7 +362,7 @@ def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Poi
     return np.concatenate([lie.transform(pose, _deskewed(scan, step, v, w)) for scan, pose, v, w in rows])
 
 
-def velocities(trajectory: Trajectory) -> NDArray[np.float64]:
+def velocities(trajectory: Trajectory) -> Matrix:
     """(N, k) twist per second from each pose to the next, the last one repeated; 0 if stamps do not increase."""
     seconds = 1e-9 * np.diff(trajectory.stamps_ns)[:, None]
     twists = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
@@ -378,14 +377,14 @@ def sampling_step(points: int) -> int:
     return max(1, points // MAX_POINTS)
 
 
-def _sharpness(eigenvalues: NDArray[np.float64]) -> Sharpness:
+def _sharpness(eigenvalues: Vector) -> Sharpness:
     """Of eigenvalues (Q, d), ascending, m²."""
     d = eigenvalues.shape[1]
     entropy = 0.5 * (d * np.log(2.0 * np.pi * np.e) + np.log(eigenvalues).sum(axis=1)).mean()
     return Sharpness(float(entropy), float(np.sqrt(eigenvalues[:, 0].mean())))
 
 
-def _deskewed(scan: Scan, step: int, before: NDArray[np.float64], after: NDArray[np.float64]) -> Points:
+def _deskewed(scan: Scan, step: int, before: Vector, after: Vector) -> Points:
     """Points as seen at the stamp, by the velocity up to it and the one from it on."""
     near = np.linalg.norm(scan.points[::step], axis=1) < REACH_M
     points = scan.points[::step][near].astype(np.float64)
@@ -397,7 +396,7 @@ def _deskewed(scan: Scan, step: int, before: NDArray[np.float64], after: NDArray
     return np.einsum("nij,nj->ni", T_stamp_point[:, :d, :d], points) + T_stamp_point[:, :d, d]
 
 
-def _eigenvalues(points: Points) -> NDArray[np.float64]:
+def _eigenvalues(points: Points) -> Matrix:
     """(Q, d) ascending, m², of the covariance around every query point; NaN where there are too few neighbors."""
     d = points.shape[1]
     queries = points[:: max(1, len(points) // MAX_QUERIES)]

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.clock import working_s
-from scanchain.data import Matrix
+from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.errors import counted
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
@@ -19,7 +18,7 @@ from scanchain.graph.problem import GraphProblem
 
 _ZERO_CHI2 = 1e-9  # share of the largest information, or of 1 if that is less, up to which χ² is rounding noise
 _EXACT = 1e-12  # share of χ² that rounding alone may amount to
-_GIVEN_UP = (0.0, 1e-6, 1e-4, 1e-2)  # shares of χ² by which the bound is lowered, tried one after the other
+_LOWERED = (0.0, 1e-6, 1e-4, 1e-2)  # shares of χ² by which the bound is lowered, tried one after the other
 _SLOPE = 0.9311  # largest norm of V(φ)⁻¹ for rotations up to π: (π²/16 + 1/4)^½
 _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, as a factor of θ*², up to 1 rad
 _FARTHEST = 1.0  # largest θ*, rad, of an edge that is bounded
@@ -69,11 +68,7 @@ class Certificate:
 
 
 def certify(
-    problem: GraphProblem,
-    poses: Matrix,
-    weights: NDArray[np.float64],
-    undetermined: str,
-    names: NDArray[np.int64],
+    problem: GraphProblem, poses: Matrix, weights: Vector, undetermined: str, names: Integers
 ) -> Certificate:
     """Certificate by a lower bound of the global minimum of Σ w eᵀΩe, for fixed weights w (E,) and any Ω.
 
@@ -101,11 +96,7 @@ def certify(
 
 
 def _gap(
-    problem: GraphProblem,
-    poses: Matrix,
-    weights: NDArray[np.float64],
-    of_edges: NDArray[np.float64],
-    names: NDArray[np.int64],
+    problem: GraphProblem, poses: Matrix, weights: Vector, of_edges: Vector, names: Integers
 ) -> tuple[float, str]:
     """χ² minus its lower bound; without a bound, all of χ² and the reason. ``of_edges`` (E,) sum to χ²."""
     chi2, n, d = float(of_edges.sum()), len(problem.free), poses.shape[-1] - 1
@@ -122,9 +113,9 @@ def _gap(
     centered[:, :-1, -1] -= centered[:, :-1, -1].mean(axis=0)
     minorants = minorize(problem, centered, weights)
     loose = np.isnan(minorants.kappa)
-    given_up = float(of_edges[loose].sum())
+    unbounded = float(of_edges[loose].sum())
     is_apart = not is_connected(problem.edges[~loose], problem.variable < 0)
-    if loose.any() and (given_up > _GIVEN_UP[-1] * chi2 or is_apart):
+    if loose.any() and (unbounded > _LOWERED[-1] * chi2 or is_apart):
         i, j = problem.edges[loose][0]
         first = f"{names[i]}-{names[j]}" if i < len(names) else f"the prior of {names[j]}"
         far = f"{counted(int(loose.sum()), 'edge')} too far from what was measured, or too little informative"
@@ -134,7 +125,7 @@ def _gap(
     packing = Packing(pattern, d + 1, at_end=True)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
     rotation = np.diag([1.0] * d + [0.0])
-    for share in _GIVEN_UP:
+    for share in _LOWERED:
         shift = share * chi2 / (d * max(n, 1))
         shifted = blocks.copy()
         shifted[:n] += shift * rotation
@@ -142,12 +133,12 @@ def _gap(
             factor.factorize(packing.values(shifted))
         except SingularMatrixError:
             continue
-        right = packing.rows(residual + shift * rotation[:, :d])
-        return min(float((right * factor.solve(right)).sum()) + given_up, chi2), ""
+        right = packing.packed(residual + shift * rotation[:, :d])
+        return min(float((right * factor.solve(right)).sum()) + unbounded, chi2), ""
     return chi2, "the dual matrix is not positive definite, as at a local minimum"
 
 
-def dual_matrix(problem: GraphProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
+def dual_matrix(problem: GraphProblem, bound: Minorants, kept: Mask) -> tuple[Matrix, Matrix]:
     """S = Q − Λ of the bounds of the edges kept (E,), as blocks of the problem's pattern, and S X* (n, d+1, d).
 
     Unknowns are G_i, the rotation of pose i relative to its estimate, in the world frame, and t_i, its position;
@@ -193,11 +184,11 @@ class Minorants:
     leap: Matrix
     force: Matrix
     torque: Matrix
-    tau: NDArray[np.float64]
-    kappa: NDArray[np.float64]
+    tau: Vector
+    kappa: Vector
 
 
-def minorize(problem: GraphProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
+def minorize(problem: GraphProblem, poses: Matrix, weights: Vector) -> Minorants:
     """Bounds that touch the χ² of every edge, times its weight (E,), at these poses.
 
     They use up a part of its isotropic information, mostly of κ.
@@ -227,7 +218,7 @@ def minorize(problem: GraphProblem, poses: Matrix, weights: NDArray[np.float64])
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, crossed, left, kappa)
 
 
-def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _isotropic(information: Matrix, d: int) -> tuple[Vector, Vector]:
     """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω: the smallest eigenvalues, lowered for the coupling."""
     tau = np.linalg.eigvalsh(information[:, :d, :d])[:, 0]
     kappa = np.linalg.eigvalsh(information[:, d:, d:])[:, 0]

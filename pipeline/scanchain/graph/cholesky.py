@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spilu
 
-from scanchain.data import Matrix
+from scanchain.data import Integers, Matrix, Vector
 from scanchain.kernels.graph import cholesky, symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
@@ -30,7 +29,7 @@ class BlockPattern:
     (row, column), each row-major. Blocks may differ in size.
     """
 
-    def __init__(self, sizes: NDArray[np.int64], pairs: NDArray[np.int64]) -> None:
+    def __init__(self, sizes: Integers, pairs: Integers) -> None:
         """Sizes (n,) in scalars of the variables; pairs (P, 2) distinct variables, each pair once."""
         variables = np.arange(len(sizes))
         self.sizes = sizes
@@ -43,7 +42,7 @@ class BlockPattern:
         squares, within = np.cumsum(sizes**2) - sizes**2, np.arange(self.scalars) - np.repeat(self.starts, sizes)
         self.diagonal = np.repeat(squares, sizes) + within * (np.repeat(sizes, sizes) + 1)  # (scalars,) of values
 
-    def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def multiply(self, values: Vector, x: Vector) -> Vector:
         """The product of the symmetric matrix of these values with a vector (scalars,)."""
         counts = self.sizes[self.rows] * self.sizes[self.columns]
         block, within = np.repeat(np.arange(len(counts)), counts), symbolic.ranges(np.zeros_like(counts), counts)
@@ -69,11 +68,11 @@ class Packing:
         self._kept = is_kept[pattern.rows][:, :, None] & is_kept[pattern.columns][:, None, :]
         self._is_whole = bool(is_kept.all())
 
-    def values(self, blocks: Matrix) -> NDArray[np.float64]:
+    def values(self, blocks: Matrix) -> Vector:
         """Block values of blocks (B, k, k)."""
         return blocks.reshape(-1) if self._is_whole else blocks[self._kept]
 
-    def blocks(self, values: NDArray[np.float64]) -> Matrix:
+    def blocks(self, values: Vector) -> Matrix:
         """Blocks (B, k, k) of block values, zero where none is stored."""
         if self._is_whole:
             return values.reshape(-1, self._k, self._k)
@@ -81,11 +80,11 @@ class Packing:
         result[self._kept] = values
         return result
 
-    def rows(self, vectors: Matrix) -> Matrix:
+    def packed(self, vectors: Matrix) -> Matrix:
         """Packed vectors (scalars, ...) of vectors (n, k, ...)."""
         return vectors[self._kept_rows]
 
-    def spread_rows(self, packed: Matrix) -> Matrix:
+    def unpacked(self, packed: Matrix) -> Matrix:
         """Vectors (n, k, ...) of packed vectors (scalars, ...), zero where none is stored."""
         result = np.zeros((*self._kept_rows.shape, *packed.shape[1:]))
         result[self._kept_rows] = packed
@@ -96,13 +95,13 @@ class Packing:
 class Analysis:
     """Symbolic analysis of the pairs: elimination order (n,), tree (n,), rows of the factor by column."""
 
-    order: NDArray[np.int64]
-    parent: NDArray[np.int64]
-    begin: NDArray[np.int64]
-    rows: NDArray[np.int64]
+    order: Integers
+    parent: Integers
+    begin: Integers
+    rows: Integers
 
 
-def analyze(pattern: BlockPattern, order: NDArray[np.int64] | None = None) -> Analysis:
+def analyze(pattern: BlockPattern, order: Integers | None = None) -> Analysis:
     """Symbolic analysis, independent of the block sizes; in a fill-reducing order unless one (n,) is given."""
     ends, n = np.concatenate([pattern.pairs, pattern.pairs[:, ::-1]]).T, len(pattern.sizes)
     links = csr_matrix((np.ones(ends.shape[1]), ends), shape=(n, n))
@@ -132,7 +131,7 @@ class SparseCholesky:
         places[order] = np.cumsum(sizes) - sizes
         self._blocks = symbolic.lay_out_blocks(self._fronts, places, pattern.sizes, pattern.rows, pattern.columns)
         self._places = np.repeat(places - pattern.starts, pattern.sizes) + np.arange(pattern.scalars)
-        self._factor: NDArray[np.float64] | None = None
+        self._factor: Vector | None = None
         self._floor = np.empty(pattern.scalars)
         self._every_front = np.arange(len(self._fronts.pivots))
         self._first_pivot = np.cumsum(self._fronts.pivots) - self._fronts.pivots
@@ -143,7 +142,7 @@ class SparseCholesky:
         """Multiplications of a factorization, roughly: the pivots of every front times its entries."""
         return float((self._fronts.pivots * np.diff(self._fronts.row_start).astype(np.float64) ** 2).sum())
 
-    def factorize(self, values: NDArray[np.float64], lost: float = _LOST_DIGITS) -> None:
+    def factorize(self, values: Vector, lost: float = _LOST_DIGITS) -> None:
         """Factor the matrix of these block values; raises SingularMatrixError if it is not definite.
 
         lost : share of its diagonal entry up to which a pivot counts as vanished
@@ -161,12 +160,12 @@ class SparseCholesky:
         self._factor = None
 
     @property
-    def factor(self) -> NDArray[np.float64]:
+    def factor(self) -> Vector:
         """Values of the last factor, laid out by fronts."""
         assert self._factor is not None, "nothing was factored since the last release"
         return self._factor
 
-    def _room(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _room(self) -> tuple[Vector, Vector]:
         """Stack and work of the kernels."""
         return np.empty(self._fronts.stack_size), np.empty(self._fronts.widest**2)
 
@@ -182,7 +181,7 @@ class SparseCholesky:
             result[:, column] = x[self._places]
         return result.reshape(right_side.shape)
 
-    def covariance_of(self, B: Matrix, variables: NDArray[np.int64]) -> Matrix:
+    def covariance_of(self, B: Matrix, variables: Integers) -> Matrix:
         """Bᵀ A⁻¹ B (m, m), by the last factor: covariance of x = Bᵀ y, where A is the information of y.
 
         B : (s, m) the scalars of these variables (v,), in their order; it is zero for the others
@@ -200,7 +199,7 @@ class SparseCholesky:
             x[reached] = 0.0
         return np.asarray(np.einsum("is,js->ij", C, C))
 
-    def _path(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _path(self, places: Integers) -> Integers:
         """Fronts that eliminate the scalars at these places, and all their ancestors, ascending."""
         path: set[int] = set()
         for front in np.unique(self._front_of[places]).tolist():
@@ -209,20 +208,20 @@ class SparseCholesky:
                 front = int(self._fronts.parent[front])
         return np.array(sorted(path), np.int64)
 
-    def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def draw(self, noise: Vector) -> Vector:
         """Solution (scalars,) of U x = z by the last factor: of covariance A⁻¹ for white noise z of variance 1."""
         x = noise.copy()
         cholesky.solve_upper(self._fronts, self.factor, x, np.empty(self._fronts.widest))
         return x[self._places]
 
-    def inverse_blocks(self) -> NDArray[np.float64]:
+    def inverse_blocks(self) -> Vector:
         """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
         result = np.empty(self.pattern.value_count)
         cholesky.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
         return result
 
 
-def _fill_reducing_order(links: csr_matrix) -> NDArray[np.int64]:
+def _fill_reducing_order(links: csr_matrix) -> Integers:
     """Variable to eliminate at each position, by multiple minimum degree (Liu 1985) as implemented in SuperLU.
 
     An incomplete factorization that drops every entry returns the ordering without the work of a full one.

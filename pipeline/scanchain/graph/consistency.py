@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scanchain import lie
-from scanchain.data import Matrix
+from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks
 from scanchain.graph.problem import GraphProblem
 
@@ -27,14 +26,14 @@ class Consistency:
     The χ² of a kept edge by itself is too small, since the edge pulls the graph toward its own measurement.
     """
 
-    def __init__(self, problem: GraphProblem, poses: Matrix, kept: NDArray[np.bool_]) -> None:
+    def __init__(self, problem: GraphProblem, poses: Matrix, kept: Mask) -> None:
         """Kept (E,): the edges in force at these poses."""
         self._problem, self._kept = problem, kept
         self._errors = problem.errors(poses)
         self._jacobians = problem.jacobians(poses, self._errors)
         self._sparse = problem.factored(poses, self._errors, kept)
 
-    def of_each(self, price: float) -> NDArray[np.float64]:
+    def of_each(self, price: float) -> Vector:
         """Distance of every edge, (E,), from all others.
 
         If a lower bound of the distance of a rejected edge, by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is already above
@@ -52,7 +51,7 @@ class Consistency:
         result[near] = self._distances(near, joint[near])
         return result
 
-    def of_group(self, group: NDArray[np.int64]) -> float:
+    def of_group(self, group: Integers) -> float:
         """Distance of a group of edges, all of them kept or none, from all others."""
         k, count = self._problem.freedom, len(group)
         J = self._jacobians[group]
@@ -64,14 +63,14 @@ class Consistency:
         P, omega = predicted.reshape(1, size, size), information.reshape(1, size, size)
         return float(_distances(self._errors[group].reshape(1, size), omega, P, self._kept[group[:1]])[0])
 
-    def _distances(self, edges: NDArray[np.int64], joint: Matrix) -> NDArray[np.float64]:
+    def _distances(self, edges: Integers, joint: Matrix) -> Vector:
         """Distances of single edges, (N,), from the covariances (N, k, k) of ξ_j − ξ_i."""
         J = self._jacobians[edges]
         predicted = J @ joint @ np.swapaxes(J, 1, 2)
         return _distances(self._errors[edges], self._problem.information[edges], predicted, self._kept[edges])
 
 
-def _distances(e: Matrix, omega: Matrix, P: Matrix, kept: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _distances(e: Matrix, omega: Matrix, P: Matrix, kept: Mask) -> Vector:
     """eᵀ(Ω⁻¹ ∓ P)⁻¹e = eᵀΩ(I ∓ PΩ)⁻¹e, (N,), from residuals (N, m) of edges that are kept or not."""
     sign = np.where(kept, -1.0, 1.0)[:, None, None]
     matrix = (1.0 + _ROUNDING) * np.eye(e.shape[1]) + sign * (P @ omega)
@@ -84,9 +83,7 @@ _MOST = 50  # largest number of edges of a group that is tested as one; larger g
 _AT_ONCE = 10_000  # about the largest number of pairs of edges compared in one call
 
 
-def agreeing_groups(
-    problem: GraphProblem, poses: Matrix, chosen: NDArray[np.bool_], limit: float
-) -> list[NDArray[np.int64]]:
+def agreeing_groups(problem: GraphProblem, poses: Matrix, chosen: Mask, limit: float) -> list[Integers]:
     """Groups of loop edges among those chosen (E,) that join the same two segments of the trajectory and agree.
 
     Two edges agree if one predicts the other along the poses between their ends: the squared Mahalanobis distance,
@@ -100,7 +97,7 @@ def agreeing_groups(
     odometry = problem.information[problem.is_odometry]
     step = np.linalg.pinv(np.median(odometry, axis=0), hermitian=True) if len(odometry) else 0.0
 
-    def agree(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def agree(a: Integers, b: Integers) -> Mask:
         errors = lie.log(lie.between(Z[b], carried(poses, edges[a], Z[a], edges[b])))
         steps = np.abs(edges[a] - edges[b]).sum(axis=1)
         covariance = noise[a] + noise[b] + steps[:, None, None] * step
@@ -110,16 +107,14 @@ def agreeing_groups(
     return [loops[each] for each in groups if len(each) <= _MOST]
 
 
-def carried(poses: Matrix, edges: NDArray[np.int64], Z: Matrix, others: NDArray[np.int64]) -> Matrix:
+def carried(poses: Matrix, edges: Integers, Z: Matrix, others: Integers) -> Matrix:
     """Relative poses of other pairs (P, 2), predicted by edges (P, 2) that measure Z and the poses between."""
     before = lie.between(poses[others[:, 0]], poses[edges[:, 0]])
     after = lie.between(poses[edges[:, 1]], poses[others[:, 1]])
     return before @ Z @ after
 
 
-def connected(
-    pairs: NDArray[np.int64], count: int, agree: Callable[..., NDArray[np.bool_]]
-) -> list[NDArray[np.int64]]:
+def connected(pairs: Integers, count: int, agree: Callable[..., Mask]) -> list[Integers]:
     """Connected groups, at least ``FEWEST`` of ``count`` items each, by the pairs (P, 2) for which agree(a, b)."""
     parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
     a, b = pairs[np.concatenate([agree(*part.T) for part in parts])].T
@@ -129,7 +124,7 @@ def connected(
     return [each for each in members if len(each) >= FEWEST]
 
 
-def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
+def apart(ends: Integers, edges: Integers) -> Integers:
     """Edges without an earlier chosen one near both of their ends: a repeated mistake does not count twice."""
     is_chosen = np.zeros(len(edges), np.bool_)
     for place, near in enumerate(KDTree(ends[edges]).query_ball_point(ends[edges], _REACH, p=np.inf)):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanchain.data import Matrix
+from scanchain.data import Integers, Matrix, Vector
 from scanchain.errors import InputError
 from scanchain.files import write_whole
 from scanchain.graph.factors import turns
@@ -22,12 +21,12 @@ def responses(problem: GraphProblem, i: int, j: int) -> Matrix:
     result[j] += np.eye(problem.freedom)
     result[i] -= np.eye(problem.freedom)
     packing = problem.packing
-    result[problem.free] = packing.spread_rows(problem.cholesky.solve(packing.rows(result[problem.free])))
+    result[problem.free] = packing.unpacked(problem.cholesky.solve(packing.packed(result[problem.free])))
     result[problem.variable < 0] = 0.0
     return result
 
 
-def difference_covariances(problem: GraphProblem, pairs: NDArray[np.int64]) -> Matrix:
+def difference_covariances(problem: GraphProblem, pairs: Integers) -> Matrix:
     """Cov(ξ_j − ξ_i, ξ_b − ξ_a), (P, P, k, k), at [(a, b), (i, j)], of the left twists of pairs (P, 2) of poses.
 
     Only the part of the factor of H between these poses and the root of the elimination tree is used.
@@ -58,7 +57,7 @@ def edge_covariances(problem: GraphProblem, blocks: Matrix) -> Matrix:
     return blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
 
 
-def displacements(problem: GraphProblem, poses: Matrix, weight: NDArray[np.float64], changes: Matrix) -> Matrix:
+def displacements(problem: GraphProblem, poses: Matrix, weight: Vector, changes: Matrix) -> Matrix:
     """First-order changes (G, K, k) of all poses when the measured motions T_ij become T_ij exp(change).
 
     changes : (G, E, k) twists in the frame of j. The left twists ξ of the poses solve H ξ = Σ w JᵀΩ change;
@@ -71,7 +70,7 @@ def displacements(problem: GraphProblem, poses: Matrix, weight: NDArray[np.float
     return result
 
 
-def pose_errors(problem: GraphProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
+def pose_errors(problem: GraphProblem, poses: Matrix, count: int, seed: int) -> Matrix:
     """Errors (count, K, k) of all poses, sampled from their joint distribution; those of fixed poses are zero.
 
     In the linearized problem with H = Uᵀ U, left twists ξ = U⁻¹ z, with z standard normal, move a position t by
@@ -86,16 +85,16 @@ def pose_errors(problem: GraphProblem, poses: Matrix, count: int, seed: int) -> 
     return errors
 
 
-def _moved(problem: GraphProblem, poses: Matrix, packed: NDArray[np.float64]) -> Matrix:
+def _moved(problem: GraphProblem, poses: Matrix, packed: Vector) -> Matrix:
     """Changes (n, k) of position and orientation of the free poses by left twists."""
     d = poses.shape[-1] - 1
-    twists = problem.packing.spread_rows(packed)
+    twists = problem.packing.unpacked(packed)
     twists[:, :d] += (turns(poses[problem.free, :d, d]) @ twists[:, d:, None])[..., 0]
     return twists
 
 
-def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Indices in ``ids`` (K,) of the poses named by ``all`` or ``0,7,12``."""
+def chosen_poses(text: str, ids: Integers) -> Integers:
+    """Integers in ``ids`` (K,) of the poses named by ``all`` or ``0,7,12``."""
     if text.strip() == "all":
         return np.arange(len(ids))
     try:
@@ -108,7 +107,7 @@ def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array([place[name] for name in wanted])
 
 
-def write_covariances(path: Path, ids: NDArray[np.int64], covariances: Matrix) -> None:
+def write_covariances(path: Path, ids: Integers, covariances: Matrix) -> None:
     """Write a CSV file with one line per pose: its id and the upper triangle of its covariance (K, k, k).
 
     The twists are in the pose's own frame, T exp(ξ), order (translation, rotation): m², m rad, rad². Raises

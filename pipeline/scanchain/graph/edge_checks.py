@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from scanchain import lie
 from scanchain.checks import LARGEST
-from scanchain.data import Matrix
+from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.errors import InputError, counted
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.factors import ORIGIN
@@ -24,18 +24,14 @@ _WEAK = 1e-6  # share of the median information up to which an edge is weak
 _LOST = 1e-10  # share of the median information up to which an axis of an edge is lost to rounding in H
 
 
-def free_text(names: NDArray[np.int64]) -> str:
+def free_text(names: Integers) -> str:
     """Number and names of free poses as one line of text."""
     return f"the edges leave {counted(len(names), 'pose')} free: {listed(names)}"
 
 
 def free_poses(
-    problem: GraphProblem,
-    poses: Matrix,
-    weights: NDArray[np.float64],
-    ranks: NDArray[np.int64],
-    names: NDArray[np.int64],
-) -> NDArray[np.int64]:
+    problem: GraphProblem, poses: Matrix, weights: Vector, ranks: Integers, names: Integers
+) -> Integers:
     """Names of the poses that move in some direction without any change of χ², at these poses and weights (E,).
 
     ranks (E,) are those of the information matrices. If edges of full rank, weak along no axis, join every pose to
@@ -66,16 +62,16 @@ def free_poses(
         held[which] = prior[which]
     ends = np.zeros((pattern.scalars, len(vanished)))
     ends[vanished, np.arange(len(vanished))] = 1.0
-    null = np.abs(problem.packing.spread_rows(problem.cholesky.solve(ends)))
+    null = np.abs(problem.packing.unpacked(problem.cholesky.solve(ends)))
     return names[problem.free[(null > _MOVES * null.max(axis=(0, 1), initial=0.0)).any(axis=(1, 2))]]
 
 
-def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def weakly_joined(edges: Integers, information: Matrix, fixed: Mask) -> Integers:
     """Poses joined to a fixed one only by edges of less than a millionth of the median information."""
     return loose(edges[_shares(information).max(axis=1, initial=0.0) > _WEAK], fixed)
 
 
-def weak_text(names: NDArray[np.int64]) -> str:
+def weak_text(names: Integers) -> str:
     """Poses constrained only by weak edges, as one line of text."""
     group = f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
     return f"{group} by edges of less than a millionth of the usual information"
@@ -91,7 +87,7 @@ def _shares(information: Matrix) -> Matrix:
     return result
 
 
-def own_equations(problem: GraphProblem, poses: Matrix, information: Matrix) -> NDArray[np.float64]:
+def own_equations(problem: GraphProblem, poses: Matrix, information: Matrix) -> Vector:
     """Block values of H = Σ JᵀΩJ, with Ω (E, k, k), over twists of every pose in its own frame, T exp(ξ)."""
     jacobian, adjoint = problem.jacobians(poses, problem.errors(poses)), lie.adjoint(poses)
     i, j = problem.edges.T
@@ -106,12 +102,7 @@ _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may ha
 
 
 def check_edges(
-    edges: NDArray[np.int64],
-    measurements: Matrix,
-    information: Matrix,
-    pose_count: int,
-    *,
-    with_origin: bool = False,
+    edges: Integers, measurements: Matrix, information: Matrix, pose_count: int, *, with_origin: bool = False
 ) -> None:
     """Raise InputError for edges to unknown poses, from a pose to itself, or with invalid numbers.
 
@@ -138,7 +129,7 @@ def check_edges(
             raise InputError(f"{f'factor of pose {j}' if with_origin and i == ORIGIN else f'edge {i}-{j}'}{words}")
 
 
-def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
+def positive_semidefinite(information: Matrix) -> Mask:
     """True for each of the finite matrices (E, k, k) that is symmetric and positive semidefinite, (E,)."""
     margin = _ROUNDING * np.abs(information).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2), initial=0.0)
@@ -152,7 +143,7 @@ def nearest_semidefinite(information: Matrix) -> Matrix:
     return 0.5 * (projected + np.swapaxes(projected, 1, 2))
 
 
-def ranks(information: Matrix) -> NDArray[np.int64]:
+def ranks(information: Matrix) -> Integers:
     """Rank of each of the positive semidefinite matrices (E, k, k), whatever their units, (E,)."""
     diagonal = np.einsum("eaa->ea", information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
@@ -160,7 +151,7 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
     return np.count_nonzero(np.linalg.eigvalsh(correlation) > _NO_INFORMATION, axis=1)
 
 
-def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64]) -> None:
+def check_connected(edges: Integers, fixed: Mask, names: Integers) -> None:
     """Raise InputError if no chain of edges joins some pose to a fixed one.
 
     fixed : of the poses, and perhaps the origin after them; names : (K,) of the poses
@@ -175,34 +166,34 @@ def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: N
         )
 
 
-def is_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> bool:
+def is_connected(edges: Integers, fixed: Mask) -> bool:
     """True if a chain of these edges joins every pose to a fixed one."""
     return not len(loose(edges, fixed))
 
 
-def loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def loose(edges: Integers, fixed: Mask) -> Integers:
     """Poses that no chain of edges joins to a fixed one."""
     _, part = _parts(edges, len(fixed))
     return np.flatnonzero(~np.isin(part, part[fixed]))
 
 
-def has_loop(edges: NDArray[np.int64], pose_count: int) -> bool:
+def has_loop(edges: Integers, pose_count: int) -> bool:
     """True if there are more edges than in a spanning forest."""
     return len(edges) > pose_count - _parts(edges, pose_count)[0]
 
 
-def skip_poses(edges: NDArray[np.int64], is_point: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def skip_poses(edges: Integers, is_point: Mask) -> Mask:
     """True for edges (E, 2) between non-consecutive poses, neither of them a point; is_point (K,)."""
     return (np.abs(edges[:, 1] - edges[:, 0]) != 1) & ~is_point[edges].any(axis=1)
 
 
-def _parts(edges: NDArray[np.int64], pose_count: int) -> tuple[int, NDArray[np.int32]]:
+def _parts(edges: Integers, pose_count: int) -> tuple[int, NDArray[np.int32]]:
     """Number of connected components of the poses, and the component of each pose."""
     links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(pose_count, pose_count))
     return connected_components(links, directed=False)
 
 
-def listed(names: NDArray[np.int64]) -> str:
+def listed(names: Integers) -> str:
     """These names, ascending, as text: "3, 5 to 9"; the first eight where they are scattered."""
     runs = np.split(names, 1 + np.flatnonzero(np.diff(names) != 1))
     shown = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run.tolist())) for run in runs[:8]]

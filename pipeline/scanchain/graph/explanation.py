@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.data import REJECTED_WEIGHT, Matrix
+from scanchain.data import REJECTED_WEIGHT, Integers, Mask, Matrix, Vector
 from scanchain.graph.consistency import apart
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks, responses
 from scanchain.graph.initialize import Initialization
@@ -19,14 +18,13 @@ from scanchain.graph.minimizer import Minimum
 from scanchain.graph.odometry_errors import (
     FEWEST,
     Explanation,
-    Loosened,
-    Vector,
+    InflatedSegment,
     changed,
     cost_of,
     direction,
+    error_twists,
     odometry_of,
     prior,
-    spread,
 )
 from scanchain.graph.optimization import Since, solve
 from scanchain.graph.problem import GraphProblem
@@ -35,7 +33,7 @@ _LARGE = 2000  # odometry edges at or above which groups of loop edges are not j
 _FEWEST = 2  # least number of rejected loop edges, none near another, for which an explanation is searched
 _MAX_STEPS = 20  # largest number of changes of an explanation in one optimization
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
-_MOST_LEFT_OUT = 30  # largest number of rejected loop edges that are evaluated
+_MOST_REJECTED = 30  # largest number of rejected loop edges that are evaluated
 _MOST_ENTRIES = 4_000_000  # largest number of entries of the covariances between these and odometry, 32 MB
 _SLIP_LENGTHS = (4, 16, 64)  # numbers of edges of the segments that are tried
 _MOST_SEGMENTS = 100  # largest number of segments that are evaluated without the estimates of the bound
@@ -78,7 +76,7 @@ class Explainer:
         if since is not None and self.config.robust == "truncated":
             return self._solved(explanation, poses, initialize, since=since)
         best = first = self._solved(explanation, poses, initialize)
-        explains = not best.problem.has_landmarks
+        explains = not best.problem.is_sighting.any()
         for _ in range(_MAX_STEPS):
             better = self._better(best) if explains and best.minimum.price else best
             if better is best:
@@ -105,17 +103,17 @@ class Explainer:
         if len(rejected) < _FEWEST or len(apart(problem.edges, rejected)) < _FEWEST:
             return []
         odometry = odometry_of(problem.edges, problem.is_odometry)
-        left_out = LeftOut(problem, best.minimum.estimate.poses, odometry, kept)
+        loops = RejectedLoops(problem, best.minimum.estimate.poses, odometry, kept)
         found: list[tuple[float, Explanation]] = []
         if not self.jumps and (now.drift.any() or len(rejected) > FEWEST):
-            gain, change = drift_step(left_out, direction(problem.edges[odometry]), now.drift, price)
+            gain, change = drift_step(loops, direction(problem.edges[odometry]), now.drift, price)
             gain -= 0.0 if now.drift.any() else FEWEST * price
             found.append((gain, replace(now, drift=now.drift + change)))
         for is_jump in (False, True)[: 1 + self.jumps]:
             measured, costs = self.measured[odometry], (price, self._nominal)
-            gain, segment = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
+            gain, segment = next_segment(loops, measured, now.inflated, *costs, is_jump=is_jump)
             if segment is not None:
-                found.append((gain, replace(now, loosened=(*now.loosened, segment))))
+                found.append((gain, replace(now, inflated=(*now.inflated, segment))))
         found.sort(key=lambda each: -each[0])
         return [explanation for gain, explanation in found if gain > _SETTLED * price]
 
@@ -152,7 +150,7 @@ class Explainer:
         return rejection_limit(self.config.robust_scale, d * (d + 1) // 2)
 
 
-class LeftOut:
+class RejectedLoops:
     """The L loop edges that a minimum rejects, and their first-order response to changes of odometry.
 
     None is near another, since edges near each other may share a mistake.
@@ -166,12 +164,10 @@ class LeftOut:
     joint : (L, O, k, k) cross-covariances of the left twists of both, Cov(ξ_end − ξ_begin, ξ_j − ξ_i)
     """
 
-    def __init__(
-        self, problem: GraphProblem, poses: Matrix, odometry: NDArray[np.int64], kept: NDArray[np.bool_]
-    ) -> None:
+    def __init__(self, problem: GraphProblem, poses: Matrix, odometry: Integers, kept: Mask) -> None:
         """Rejected loop edges of a minimum with the edges kept (E,)."""
         edges = apart(problem.edges, np.flatnonzero(problem.is_loop & ~kept))
-        most = min(_MOST_LEFT_OUT, _MOST_ENTRIES // (max(len(odometry), 1) * problem.freedom**2))
+        most = min(_MOST_REJECTED, _MOST_ENTRIES // (max(len(odometry), 1) * problem.freedom**2))
         self.stride = max(1, -(-len(edges) // max(most, 1)))
         self.problem, self.odometry, self.edges = problem, odometry, edges[:: self.stride]
         self.errors = problem.errors(poses)
@@ -189,13 +185,13 @@ class LeftOut:
             moved = responses(self.factored, *problem.edges[edge])
             self.joint[place] = moved[end] - moved[begin]
 
-    def weighed(self, spread: Matrix | float = 0.0) -> tuple[Matrix, Matrix]:
+    def weighed(self, sigma: Matrix | float = 0.0) -> tuple[Matrix, Matrix]:
         """Residuals (L, k) of these loop edges, and their information (L, k, k), multiplied by ``stride``.
 
-        spread : additional standard deviations (L, k)
+        sigma : additional standard deviations (L, k)
         """
         k = self.errors.shape[1]
-        noise = self.covariances + np.square(spread)[..., None] * np.eye(k)
+        noise = self.covariances + np.square(sigma)[..., None] * np.eye(k)
         information = np.asarray(self.stride * np.linalg.inv(noise), np.float64)
         return self.errors[self.edges], information
 
@@ -206,7 +202,7 @@ class LeftOut:
         for edge, joint in zip(self.edges, self.joint[:, among], strict=True):
             yield self.jacobians[edge] @ (np.swapaxes(joint, 1, 2) @ pull)
 
-    def quadratic(self, twists: Matrix, among: slice = slice(None)) -> tuple[NDArray[np.float64], Matrix]:
+    def quadratic(self, twists: Matrix, among: slice = slice(None)) -> tuple[Vector, Matrix]:
         """Slope b (p,) and curvature A (p, p) of the cost along right twists τ (n, k, p) of odometry edges.
 
         With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ; the cost of the kept edges changes by δᵀAδ − 2 bᵀδ,
@@ -219,7 +215,7 @@ class LeftOut:
         b = np.einsum("oap,oa->p", weighted, self.errors[odometry])
         return b, A
 
-    def _pull(self, weighted: Matrix, edges: NDArray[np.int64]) -> Matrix:
+    def _pull(self, weighted: Matrix, edges: Integers) -> Matrix:
         """Σ JᵀΩτ of the poses, (scalars, p), of Ωτ (n, k, p) of some edges."""
         problem = self.problem
         forces = np.swapaxes(self.jacobians[edges], 1, 2) @ weighted
@@ -227,45 +223,45 @@ class LeftOut:
         begin, end = problem.edges[edges].T
         np.add.at(whole, end, forces)
         np.add.at(whole, begin, -forces)
-        return self.factored.packing.rows(whole[problem.free])
+        return self.factored.packing.packed(whole[problem.free])
 
 
-def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
+def drift_step(loops: RejectedLoops, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
     """First-order decrease of the cost by the best change of the drift, and this change.
 
     Each round treats the error of the linearization, a share of the change found in the last round, as noise.
     """
-    odometry = left_out.odometry
-    twists = lie.log(left_out.problem.measurements[odometry])
+    odometry = loops.odometry
+    twists = lie.log(loops.problem.measurements[odometry])
     B = np.stack([changed(twists, unit, sign) - twists for unit in np.eye(len(drift))], axis=-1)  # ∂Z/∂drift
     d = twists.shape[1] - len(drift) + 1
-    B[:, :d, 0] += left_out.errors[odometry, :d]  # the noise grows with the scale
-    slope, curvature = left_out.quadratic(B)
-    V, own = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)]), prior(len(drift))
-    A, b, price = curvature + np.diag(own), slope - own * drift, left_out.stride * price
+    B[:, :d, 0] += loops.errors[odometry, :d]  # the noise grows with the scale
+    slope, curvature = loops.quadratic(B)
+    V, own = np.array([shift.sum(axis=0) for shift in loops.shifts(B)]), prior(len(drift))
+    A, b, price = curvature + np.diag(own), slope - own * drift, loops.stride * price
     alone = np.asarray(np.linalg.solve(A, b), np.float64)
     fall, change = float(b @ alone) * drift.any(), alone * drift.any()
     for _ in range(_DRIFT_ROUNDS):
         moved = V @ change
         lengths = [np.linalg.norm(part, axis=1) for part in (moved[:, :d], moved[:, d:])]
-        spread = _CURVATURE * np.repeat(np.stack(lengths, axis=1), (d, moved.shape[1] - d), axis=1)
-        found = _largest_fall(A, b, *left_out.weighed(spread), V, price)
+        sigma = _CURVATURE * np.repeat(np.stack(lengths, axis=1), (d, moved.shape[1] - d), axis=1)
+        found = _largest_fall(A, b, *loops.weighed(sigma), V, price)
         fall, change = max((fall, change), found, key=lambda each: each[0])
     return fall, change
 
 
-def next_loosened(
-    left_out: LeftOut,
+def next_segment(
+    loops: RejectedLoops,
     measured: Matrix,
-    others: tuple[Loosened, ...],
+    others: tuple[InflatedSegment, ...],
     price: float,
     nominal: float,
     *,
     is_jump: bool,
-) -> tuple[float, Loosened | None]:
+) -> tuple[float, InflatedSegment | None]:
     """First-order decrease of the cost by the best additional slip or jump, and this; None if none lowers it.
 
-    measured : (O, d+1, d+1) measurements of odometry, in the order of ``left_out.odometry``
+    measured : (O, d+1, d+1) measurements of odometry, in the order of ``loops.odometry``
     Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included. A rejected loop edge then
     costs min(price, (e + V t)ᵀC⁻¹(e + V t)) instead of its price. Each of these edges gives a candidate t.
 
@@ -278,20 +274,20 @@ def next_loosened(
     if not tried:
         return 0.0, None
     first, count = np.array([(segment.first, segment.count) for segment in tried]).T
-    information = left_out.problem.information[left_out.odometry]
-    B = spread(measured, information, is_jump=is_jump)
+    information = loops.problem.information[loops.odometry]
+    B = error_twists(measured, information, is_jump=is_jump)
     pull = information @ B
     pull_t, unit = np.swapaxes(pull, 1, 2), np.eye(B.shape[2])
     own = np.swapaxes(B, 1, 2) @ pull
     claimed = _means(own, first, count) / count[:, None, None]
-    learned = _means(own - pull_t @ left_out.predicted @ pull, first, count)
+    learned = _means(own - pull_t @ loops.predicted @ pull, first, count)
     A = unit + (learned if is_jump else np.minimum(learned, claimed))
-    b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
+    b = _means(pull_t @ loops.errors[loops.odometry][..., None], first, count)[..., 0]
     costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
-    e, M, price = *left_out.weighed(), left_out.stride * price
+    e, M, price = *loops.weighed(), loops.stride * price
     alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without explaining any of them
     hoped = -costs
-    for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):
+    for error, weight, shift in zip(e, M, loops.shifts(B), strict=True):
         V = _means(shift, first, count)
         g = b / len(e) - np.swapaxes(V, 1, 2) @ (weight @ error)
         H = A / len(e) + np.swapaxes(V, 1, 2) @ weight @ V
@@ -302,8 +298,8 @@ def next_loosened(
         if not hoped[index] > most:
             break
         segment, twists = tried[index], B[tried[index].edges] / count[index]
-        slope, curvature = left_out.quadratic(twists, segment.edges)
-        V = np.stack([shift.sum(axis=0) for shift in left_out.shifts(twists, segment.edges)])
+        slope, curvature = loops.quadratic(twists, segment.edges)
+        V = np.stack([shift.sum(axis=0) for shift in loops.shifts(twists, segment.edges)])
         fall, _ = _largest_fall(unit + curvature, slope, e, M, V, price)
         if fall - costs[index] > most:
             most, best = fall - float(costs[index]), segment
@@ -330,16 +326,16 @@ def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: 
     return largest, best
 
 
-def _means(each: Matrix, first: NDArray[np.int64], count: NDArray[np.int64]) -> Matrix:
+def _means(each: Matrix, first: Integers, count: Integers) -> Matrix:
     """Mean (S, ...) over the edges of each segment, of values (O, ...)."""
     sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
     return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
 
 
-def _segments(edges: int, others: tuple[Loosened, ...], *, is_jump: bool) -> list[Loosened]:
+def _segments(edges: int, others: tuple[InflatedSegment, ...], *, is_jump: bool) -> list[InflatedSegment]:
     """Segments of every length among this many edges, each shifted by half its length, that overlap no others."""
     return [
-        Loosened(first, length, is_jump)
+        InflatedSegment(first, length, is_jump)
         for length in ((1,) if is_jump else _SLIP_LENGTHS)
         for first in range(0, edges - length + 1, max(length // 2, 1))
         if all(first >= other.edges.stop or other.first >= first + length for other in others)

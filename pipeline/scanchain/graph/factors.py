@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scanchain import checks, lie
-from scanchain.data import Matrix, Pose
+from scanchain.data import Integers, Mask, Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.kernels.graph import between
 
@@ -50,14 +50,14 @@ class Factor:
             wanted = f"finite numbers of the shape (2, {count}) for two poses, as information is {count} x {count}"
             raise InputError(f"{type(self).__name__}.error returned {found.tolist()}; wanted {wanted}")
 
-    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+    def residual(self, poses: Matrix, edges: Integers, Z: Matrix) -> Matrix:
         """Residuals e (E, k) of edges (E, 2) that measure Z (E, d+1, d+1), at these poses; zero from m on."""
         error = self.error(lie.between(*poses[edges.T]), Z)
         errors = np.zeros((len(edges), lie.twist_size(poses)))
         errors[:, : error.shape[1]] = error
         return errors
 
-    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+    def linearize(self, poses: Matrix, edges: Integers, Z: Matrix, errors: Matrix) -> Matrix:
         """∂e/∂ξ_j (E, k, k) for left twists, T_j ← exp(ξ_j) T_j, where the residuals are these errors (E, k).
 
         Since e depends on T_i⁻¹ T_j alone, the same left twist of both poses changes nothing, and
@@ -77,14 +77,14 @@ class Between(Factor):
         """See ``Factor``."""
         return lie.log(lie.between(Z, T_ij))
 
-    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+    def residual(self, poses: Matrix, edges: Integers, Z: Matrix) -> Matrix:
         """See ``Factor``; compiled."""
         errors = np.empty((len(edges), lie.twist_size(poses)))
         residuals = between.residuals_2d if errors.shape[1] == 3 else between.residuals_3d
         residuals(read_only(poses), read_only(edges), read_only(Z), errors)
         return errors
 
-    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+    def linearize(self, poses: Matrix, edges: Integers, Z: Matrix, errors: Matrix) -> Matrix:
         """See ``Factor``; compiled."""
         jacobian = np.empty((*errors.shape, errors.shape[1]))
         if errors.shape[1] == 3:
@@ -117,7 +117,7 @@ class Position(Factor):
         d = Z.shape[-1] - 1
         return ((T_ij[:, None, :d, d] - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
 
-    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+    def residual(self, poses: Matrix, edges: Integers, Z: Matrix) -> Matrix:
         """See ``Factor``; computed without the rotation of j."""
         d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
         seen = (T_j[:, None, :d, d] - T_i[:, None, :d, d]) @ T_i[:, :d, :d]
@@ -125,7 +125,7 @@ class Position(Factor):
         errors[:, :d] = ((seen - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
         return errors
 
-    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+    def linearize(self, poses: Matrix, edges: Integers, Z: Matrix, errors: Matrix) -> Matrix:
         """R_zᵀ R_iᵀ [I, ∂t_j/∂φ]."""
         d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
         R_t = np.swapaxes(T_i[:, :d, :d] @ Z[:, :d, :d], 1, 2)
@@ -180,12 +180,7 @@ LOOPS, SIGHTINGS = _kinds(Loop, LoopSighting), _kinds(Sighting)
 WHOLE = _kinds(Between)  # those that measure position and rotation
 
 
-def kinds_of(
-    edges: NDArray[np.int64],
-    information: Matrix,
-    is_point: NDArray[np.bool_],
-    is_loop: NDArray[np.bool_] | bool = False,
-) -> NDArray[np.int64]:
+def kinds_of(edges: Integers, information: Matrix, is_point: Mask, is_loop: Mask | bool = False) -> Integers:
     """Kind (E,) of edges between poses: those to points, or whose Ω (E, k, k) has no rotation, are sightings.
 
     is_point : (K,) of the poses; is_loop : (E,), by default none

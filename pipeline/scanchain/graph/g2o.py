@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import count as numbers_from
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation as Turn
 
 from scanchain import checks, lie
 from scanchain.checks import LARGEST
-from scanchain.data import Matrix, brief
+from scanchain.data import Integers, Mask, Matrix, brief
 from scanchain.errors import InputError, counted, shown
 from scanchain.files import write_whole
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, skip_poses
@@ -63,8 +62,8 @@ TAGS = {
     "EDGE3": Tag(3, 2, (*range(6), *range(7, 28)), is_toro=True),
 }
 PRIOR_TAGS = {  # of unary edges; in 3D the vertex id is followed by the id of a sensor offset
+    "EDGE_PRIOR_SE2_XY": Tag(2, 1, (0, 1, 3, 4, 6)),  # read only: also EDGE_PRIOR_SE2 without information on θ
     "EDGE_PRIOR_SE2": Tag(2, 1, tuple(range(9))),
-    "EDGE_PRIOR_SE2_XY": Tag(2, 1, (0, 1, 3, 4, 6)),
     "EDGE_PRIOR_XY": Tag(2, 1, (0, 1, 3, 4, 6), is_point=True),
     "EDGE_SE3_PRIOR": Tag(3, 2, tuple(range(28))),
 }
@@ -74,17 +73,18 @@ _WIDTHS = {(2, 1): 3, (2, 2): 9, (3, 1): 7, (3, 2): 28}  # numbers of a complete
 
 
 def write_lines(
-    dimension: int, ids: NDArray[np.int64], numbers: Matrix, is_point: NDArray[np.bool_], *, is_toro: bool
+    dimension: int, ids: Integers, numbers: Matrix, is_point: Mask, of: dict[str, Tag], *, is_toro: bool = False
 ) -> list[str]:
     """Lines of vertices, ids (n, 1), or edges (n, 2), from the numbers (n, m) of complete g2o lines.
 
+    of : the tags to choose from; the last that fits
     Every number is written with the fewest digits that read back as the same value.
     """
     if is_toro and dimension == 3:
         numbers = np.hstack([numbers[:, :3], to_angles(numbers[:, 3:7]), numbers[:, 6:]])
     tags = {
         tag.is_point: (name, tag.columns)
-        for name, tag in TAGS.items()
+        for name, tag in of.items()
         if (tag.dimension, tag.ids, tag.is_toro) == (dimension, ids.shape[1], is_toro)
     }
     lines = []
@@ -113,10 +113,10 @@ class Rows(NamedTuple):
     is_point : (n,) bool, points or edges to points
     """
 
-    lines: NDArray[np.int64]
-    ids: NDArray[np.int64]
+    lines: Integers
+    ids: Integers
     numbers: Matrix
-    is_point: NDArray[np.bool_]
+    is_point: Mask
 
 
 class Lines:
@@ -166,16 +166,14 @@ class Lines:
         """An error with this line number."""
         return InputError(f"{self.path}:{line}: {text}")
 
-    def indices(
-        self, lines: NDArray[np.int64], names: NDArray[np.int64], ids: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
-        """Indices (n, w) in ``ids`` (K,) of the vertices that lines (n,) name."""
+    def indices(self, lines: Integers, names: Integers, ids: Integers) -> Integers:
+        """Integers (n, w) in ``ids`` (K,) of the vertices that lines (n,) name."""
         order = np.argsort(ids)
         indices = order[np.minimum(np.searchsorted(ids, names, sorter=order), len(ids) - 1)]
         self.check_known(lines, names, ids[indices] == names)
         return indices
 
-    def check_known(self, lines: NDArray[np.int64], names: NDArray[np.int64], is_known: NDArray[np.bool_]) -> None:
+    def check_known(self, lines: Integers, names: Integers, is_known: Mask) -> None:
         """Raise InputError for lines (n,) that name vertices (n, w) missing in the file."""
         for row, column in np.argwhere(~is_known)[:1]:
             raise self.error(lines[row], f"vertex {names[row, column]} is not in the file; add its VERTEX line")
@@ -274,7 +272,7 @@ def write_g2o(
     path: Path | str,
     graph: PoseGraph,
     *,
-    ids: NDArray[np.int64] | None = None,
+    ids: Integers | None = None,
     other_lines: Iterable[str] = (),
     edges: Chosen = "in force",
     rotation: Rotation = "vector",
@@ -309,17 +307,21 @@ def write_g2o(
     triangles = information[:, *np.triu_indices(graph.freedom)]
     of_edges = np.hstack([_numbers(graph.measurements[chosen]), triangles])
     lines = [ROTATION_COMMENT[rotation]] if has_quaternions else []
-    lines += write_lines(d, names[:, None], _numbers(graph.poses), graph.is_point, is_toro=is_toro)
+    lines += write_lines(d, names[:, None], _numbers(graph.poses), graph.is_point, TAGS, is_toro=is_toro)
     lines += [f"FIX {names[index]}" for index in graph.held]
-    between, of_one = pairs[~is_prior], of_edges[is_prior]
-    lines += write_lines(d, names[between], of_edges[~is_prior], graph.is_point[between[:, 1]], is_toro=is_toro)
-    others, seen = list(other_lines), pairs[is_prior, 1]
-    lines += _prior_lines(d, names[seen], of_one, information[is_prior], graph.is_point[seen], others)
+    to_point, others, seen = graph.is_point[pairs[:, 1]], list(other_lines), names[pairs[is_prior, 1], None]
+    between = names[pairs[~is_prior]], of_edges[~is_prior], to_point[~is_prior]
+    lines += write_lines(d, *between, TAGS, is_toro=is_toro)
+    if d == 3 and len(seen):
+        sensor, line = _sensor(others)
+        lines += [line] if line not in others else []
+        seen = np.insert(seen, 1, sensor, axis=1)
+    lines += write_lines(d, seen, of_edges[is_prior], to_point[is_prior], PRIOR_TAGS)
     with checks.writing(path, force=force):
         write_whole(path, "\n".join([*lines, *others, ""]).encode())
 
 
-def _written(path: Path, graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _written(path: Path, graph: PoseGraph, chosen: Mask) -> Mask:
     """The chosen edges (E,) that the format can represent."""
     left_out = chosen & graph.is_custom
     if left_out.any():
@@ -328,30 +330,12 @@ def _written(path: Path, graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray
     return chosen & ~graph.is_custom
 
 
-def _prior_lines(
-    d: int,
-    names: NDArray[np.int64],
-    numbers: Matrix,
-    information: Matrix,
-    is_point: NDArray[np.bool_],
-    others: list[str],
-) -> list[str]:
-    """Lines of priors (n,) on whole poses or, where Ω has no rotation, on positions.
-
-    In 3D a sensor without an offset is defined first, with an id that no parameter in ``others`` has, the other
-    lines of the file.
-    """
-    used = {words[1] for words in map(str.split, others) if words[0].startswith("PARAMS") and len(words) > 1}
-    sensors = ((str(number), f"{_OFFSET} {number} 0 0 0 0 0 0 1") for number in numbers_from(0))
-    sensor, line = next(each for each in sensors if each[1] in others or each[0] not in used)
-    lines = [line] if d == 3 and len(names) and line not in others else []
-    tag = "EDGE_SE3_PRIOR"
-    for name, row, omega, point in zip(names.tolist(), numbers.tolist(), information, is_point, strict=True):
-        if d == 2:
-            tag = "EDGE_PRIOR_XY" if point else "EDGE_PRIOR_SE2" if omega[d:].any() else "EDGE_PRIOR_SE2_XY"
-        ids = [str(name), sensor][: PRIOR_TAGS[tag].ids]
-        lines.append(" ".join([tag, *ids, *(repr(row[column]) for column in PRIOR_TAGS[tag].columns)]))
-    return lines
+def _sensor(others: list[str]) -> tuple[int, str]:
+    """Id and line of a sensor without an offset: one of these lines, or a new one whose id none of them has."""
+    parameters = (words for words in map(str.split, others) if len(words) > 1 and words[0].startswith("PARAMS"))
+    used = {words[1] for words in parameters}
+    sensors = ((number, f"{_OFFSET} {number} 0 0 0 0 0 0 1") for number in itertools.count())
+    return next((number, line) for number, line in sensors if line in others or str(number) not in used)
 
 
 def _numbers(poses: Matrix) -> Matrix:
@@ -405,7 +389,7 @@ class G2oFile:
 
     __repr__ = brief
     graph: PoseGraph
-    ids: NDArray[np.int64]
+    ids: Integers
     other_lines: tuple[str, ...]
     has_guess: bool
     projection: Projection | None
@@ -471,8 +455,8 @@ def read_g2o(
     return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
 
 
-def _pairs(lines: Lines, ids: NDArray[np.int64], is_point: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Indices (E, 2) of the poses and points of all edges, which are of the kind that the tags say."""
+def _pairs(lines: Lines, ids: Integers, is_point: Mask) -> Integers:
+    """Integers (E, 2) of the poses and points of all edges, which are of the kind that the tags say."""
     edges, between = lines.edges, slice(lines.between)
     pairs = lines.indices(edges.lines, edges.ids, ids)
     is_right = is_point[pairs[:, 1]] == edges.is_point
@@ -522,7 +506,7 @@ def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Proje
     return projection
 
 
-def _vertices(lines: Lines) -> tuple[NDArray[np.int64], NDArray[np.bool_], Matrix]:
+def _vertices(lines: Lines) -> tuple[Integers, Mask, Matrix]:
     """Ids (K,), of poses and then of points, each ascending; is_point (K,); and poses (K, d+1, d+1).
 
     Without vertex lines the ids are those in the edges, and the poses are the identity.

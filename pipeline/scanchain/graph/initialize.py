@@ -6,12 +6,11 @@ from contextlib import suppress
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from scanchain import lie
-from scanchain.data import Matrix
+from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky
 from scanchain.graph.problem import GraphProblem
 
@@ -54,38 +53,38 @@ def _by(method: Initialization, problem: GraphProblem, poses: Matrix) -> Matrix:
     """Poses by "odometry", "spanning-tree" or "chordal".
 
     Where no edge measures a rotation relative to a fixed pose, they are computed relative to the first pose and
-    then moved rigidly to the positions that are measured relative to fixed ones (Umeyama 1991).
+    then moved rigidly to the positions that are measured relative to fixed ones.
     """
-    fixed, d = problem.variable < 0, poses.shape[-1] - 1
-    from_fixed = fixed[problem.edges].any(axis=1)
-    if (from_fixed & problem.is_bounded & problem.information[:, d:].any(axis=(1, 2))).any():
-        return _relative(method, problem, poses)
-    is_anchor = fixed.copy()
-    is_anchor[problem.free[~problem.is_point[problem.free]][:1]] = True
-    rest = ~from_fixed
-    edges = problem.edges[rest], problem.measurements[rest], problem.information[rest]
-    local = GraphProblem(*edges, is_anchor, problem.is_point, problem.kind[rest], problem.factors)
-    result = _relative(method, local, poses)
-    chosen = fixed[problem.edges[:, 0]] & problem.is_bounded
+    fixed, d, local = problem.variable < 0, poses.shape[-1] - 1, problem
+    from_fixed = np.asarray(fixed[problem.edges].any(axis=1))
+    is_adrift = not problem.information[from_fixed & problem.is_bounded, d:].any()
+    if is_adrift:
+        fixed[problem.free[~problem.is_point[problem.free]][:1]] = True
+        local = problem.restricted(~from_fixed, fixed)
+    if method == "chordal":
+        result = relax_chordally(local, poses)
+    else:
+        follow, whole = follow_odometry if method == "odometry" else follow_spanning_tree, local.is_whole
+        result = follow(poses, fixed, local.edges[whole], local.measurements[whole])
+    return _aligned(problem, result) if is_adrift else result
+
+
+def _aligned(problem: GraphProblem, poses: Matrix) -> Matrix:
+    """Free poses moved rigidly to the positions that are measured relative to fixed ones (Umeyama 1991)."""
+    d, chosen = poses.shape[-1] - 1, (problem.variable[problem.edges[:, 0]] < 0) & problem.is_bounded
     i, j = problem.edges[chosen].T
-    seen, found = (poses[i] @ problem.measurements[chosen])[:, :d, d], result[j, :d, d]
-    weight = np.trace(problem.information[chosen, :d, :d], axis1=1, axis2=2)[:, None]
-    share = weight / max(weight.sum(), 1e-300)
-    R = _nearest_rotation((share * (seen - (share * seen).sum(axis=0))).T[None] @ found)[0]
-    result[problem.free, :d, d] = result[problem.free, :d, d] @ R.T + (share * (seen - found @ R.T)).sum(axis=0)
-    turned = problem.free[~problem.is_point[problem.free]]
-    result[turned, :d, :d] = R @ result[turned, :d, :d]
+    seen, found = (poses[i] @ problem.measurements[chosen])[:, :d, d], poses[j, :d, d]
+    share = np.trace(problem.information[chosen, :d, :d], axis1=1, axis2=2)[:, None]
+    share /= max(share.sum(), 1e-300)
+    result, T = poses.copy(), lie.identity(d)
+    T[:d, :d] = _nearest_rotation((share * (seen - (share * seen).sum(axis=0))).T[None] @ found)[0]
+    T[:d, d] = (share * (seen - found @ T[:d, :d].T)).sum(axis=0)
+    result[problem.free] = T @ poses[problem.free]
+    result[problem.is_point, :d, :d] = np.eye(d)
     return result
 
 
-def _relative(method: Initialization, problem: GraphProblem, poses: Matrix) -> Matrix:
-    if method == "chordal":
-        return relax_chordally(problem, poses)
-    follow, whole = follow_odometry if method == "odometry" else follow_spanning_tree, problem.is_whole
-    return follow(poses, problem.variable < 0, problem.edges[whole], problem.measurements[whole])
-
-
-def _with_points(problem: GraphProblem, poses: Matrix, to_point: NDArray[np.bool_]) -> Matrix:
+def _with_points(problem: GraphProblem, poses: Matrix, to_point: Mask) -> Matrix:
     """Poses with every free point at the mean of its positions as seen from poses, by these edges (E,)."""
     i, j = problem.edges[to_point].T
     total = np.zeros(poses.shape)
@@ -96,7 +95,7 @@ def _with_points(problem: GraphProblem, poses: Matrix, to_point: NDArray[np.bool
     return result
 
 
-def follow_odometry(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+def follow_odometry(poses: Matrix, fixed: Mask, edges: Integers, Z: Matrix) -> Matrix:
     """Poses chained along edges between successive poses or, where one is missing, the next closest indices."""
     pairs, first = _distinct_pairs(edges, len(poses))
     low, high = np.divmod(pairs, len(poses))
@@ -105,7 +104,7 @@ def follow_odometry(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.i
     return follow_spanning_tree(poses, fixed, edges[kept], Z[kept])
 
 
-def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+def follow_spanning_tree(poses: Matrix, fixed: Mask, edges: Integers, Z: Matrix) -> Matrix:
     """Poses (K, d+1, d+1) chained from the fixed ones along the fewest edges; unreachable ones stay."""
     count, fixed_poses = len(poses), np.flatnonzero(fixed)
     from_root = np.stack([np.full(len(fixed_poses), count), fixed_poses])  # an extra root with all fixed poses
@@ -124,12 +123,12 @@ def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray
     return poses[parent] @ motion
 
 
-def _distinct_pairs(edges: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _distinct_pairs(edges: Integers, count: int) -> tuple[Integers, Integers]:
     """Integer key of every pair of poses that edges (E, 2) join, ascending, and the first edge of each."""
     return np.unique(_pairs(edges[:, 0], edges[:, 1], count), return_index=True)
 
 
-def _pairs(i: NDArray[np.int64], j: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _pairs(i: Integers, j: Integers, count: int) -> Integers:
     """Integer key of each unordered pair of ``count`` poses."""
     return np.minimum(i, j) * count + np.maximum(i, j)
 
@@ -157,9 +156,7 @@ def relax_chordally(problem: GraphProblem, poses: Matrix) -> Matrix:
     return result
 
 
-def _least_squares(
-    problem: GraphProblem, A: Matrix, weight: NDArray[np.float64], offset: Matrix, known: Matrix
-) -> Matrix:
+def _least_squares(problem: GraphProblem, A: Matrix, weight: Vector, offset: Matrix, known: Matrix) -> Matrix:
     """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed.
 
     Points, which have no rotation, get a unit prior on it.

@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from scanchain import plugins
 from scanchain.config import LOSSES
+from scanchain.data import Integers, Mask, Vector
 from scanchain.errors import InputError, one_line
-
-Array = NDArray[np.float64]
 
 _TRUE_SHARE = 0.999  # share of true loops whose χ² stays below the limit, if the noise model is right
 _SHARP = 1e4  # control above which truncated least squares is replaced by its limit
@@ -34,11 +32,11 @@ class Kernel(Protocol):
     Without this method the loss is minimized directly, with μ = 1.
     """
 
-    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+    def weight(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Weight w = dρ/dχ² in [0, 1], 1 near zero for any scale."""
         ...
 
-    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+    def loss(self, chi2: Vector, s: float, mu: float) -> Vector:
         """ρ(χ²), equal to χ² near zero."""
         ...
 
@@ -65,11 +63,11 @@ def _sharpened(ratio: float) -> Iterator[float]:
 class Quadratic:
     """ρ = χ²: no robust loss."""
 
-    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+    def weight(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Weight w = 1."""
         return np.ones_like(chi2)
 
-    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+    def loss(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Loss ρ = χ²."""
         return chi2
 
@@ -77,11 +75,11 @@ class Quadratic:
 class Huber:
     """Huber 1964: linear in χ above s."""
 
-    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+    def weight(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Weight w = min(1, s/χ)."""
         return s / np.sqrt(np.maximum(chi2, s**2))
 
-    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+    def loss(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Loss ρ = 2 s χ − s² above s."""
         s2 = s**2
         return np.where(chi2 <= s2, chi2, 2.0 * s * np.sqrt(np.maximum(chi2, s2)) - s2)
@@ -90,11 +88,11 @@ class Huber:
 class Cauchy:
     """Loss of the Cauchy distribution: grows without bound, but slowly."""
 
-    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+    def weight(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Weight w = s² / (s² + χ²)."""
         return s**2 / (s**2 + chi2)
 
-    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+    def loss(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Loss ρ = s² log(1 + χ²/s²)."""
         return s**2 * np.log1p(chi2 / s**2)
 
@@ -104,11 +102,11 @@ class GemanMcClure:
 
     schedule = staticmethod(_widened)
 
-    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+    def weight(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Weight w = (μ s² / (μ s² + χ²))²."""
         return (mu * s**2 / (mu * s**2 + chi2)) ** 2
 
-    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+    def loss(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Loss ρ = μ s² χ² / (μ s² + χ²)."""
         return chi2 * mu * s**2 / (mu * s**2 + chi2)
 
@@ -118,11 +116,11 @@ class Tukey:
 
     schedule = staticmethod(_widened)
 
-    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+    def weight(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Weight w = (1 − χ²/(μ s²))² or 0."""
         return np.maximum(1.0 - chi2 / (mu * s**2), 0.0) ** 2
 
-    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+    def loss(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Loss ρ = μ s² (1 − (1 − χ²/(μ s²))³) / 3, or μ s²/3."""
         share = np.minimum(chi2 / (mu * s**2), 1.0)
         return mu * s**2 * share * (1.0 - share + share**2 / 3.0)
@@ -133,14 +131,14 @@ class Truncated:
 
     schedule = staticmethod(_sharpened)
 
-    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+    def weight(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Weight w = 1 or 0, and s √(μ (μ + 1))/χ − μ between."""
         if np.isinf(mu):
             return (chi2 <= s**2).astype(np.float64)
         middle = s * np.sqrt(mu * (mu + 1.0) / np.maximum(chi2, 1e-300)) - mu
         return np.clip(middle, 0.0, 1.0)
 
-    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+    def loss(self, chi2: Vector, s: float, mu: float) -> Vector:
         """Loss ρ = min(χ², s²), and 2 s χ √(μ (μ + 1)) − μ (s² + χ²) between."""
         s2 = s**2
         if np.isinf(mu):
@@ -162,15 +160,15 @@ class RobustLoss:
     scale: float
     control: float
 
-    def weight(self, chi2: Array) -> Array:
+    def weight(self, chi2: Vector) -> Vector:
         """Weight in [0, 1] of residuals with these χ²."""
         return _kernel(self.kernel).weight(chi2, self.scale, self.control)
 
-    def loss(self, chi2: Array) -> Array:
+    def loss(self, chi2: Vector) -> Vector:
         """ρ(χ²), equal to χ² near zero."""
         return _kernel(self.kernel).loss(chi2, self.scale, self.control)
 
-    def graduated(self, chi2: Array) -> Iterator[RobustLoss]:
+    def graduated(self, chi2: Vector) -> Iterator[RobustLoss]:
         """Losses of its GNC schedule, from a convex one, for residuals that begin at these χ², to itself."""
         schedule = getattr(_kernel(self.kernel), "schedule", None)
         ratio = 2.0 * float(chi2.max(initial=0.0)) / self.scale**2
@@ -183,7 +181,7 @@ def rejection_limit(scale: float, degrees: int) -> float:
     return max(scale**2, 2.0 * float(gammaincinv(0.5 * degrees, _TRUE_SHARE)))
 
 
-def limit_shares(scale: float, residuals: NDArray[np.int64], freedom: int) -> Array:
+def limit_shares(scale: float, residuals: Integers, freedom: int) -> Vector:
     """``rejection_limit`` of edges with these numbers of residuals (E,), as shares of that of a whole pose."""
     limits = np.array([rejection_limit(scale, max(count, 1)) for count in range(freedom + 1)])
     return limits[residuals] / limits[freedom]
@@ -236,20 +234,20 @@ class InlierSet:
     price : cost of rejecting an edge, in χ²
     """
 
-    kept: NDArray[np.bool_]
+    kept: Mask
     price: float
     kernel: Literal["truncated"] = "truncated"
 
-    def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+    def weight(self, chi2: Vector) -> Vector:
         """1 or 0, whatever the residuals."""
         return self.kept.astype(np.float64)
 
-    def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+    def loss(self, chi2: Vector) -> Vector:
         """χ² or the price."""
         return np.where(self.kept, chi2, self.price)
 
 
-def fair_price(against: Array, nominal: float, residuals: NDArray[np.int64]) -> float:
+def fair_price(against: Vector, nominal: float, residuals: Integers) -> float:
     """The price, lowered if the distances ``against`` (L,) of kept edges show that the noise model is pessimistic.
 
     With information matrices that are far too small any edge would be accepted. The factor is the median of the

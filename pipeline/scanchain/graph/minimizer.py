@@ -9,9 +9,8 @@ from functools import partial
 from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanchain.data import Matrix
+from scanchain.data import Mask, Matrix, Vector
 from scanchain.errors import counted
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.initialize import Initialization
@@ -34,7 +33,7 @@ class Evaluation:
 
     poses: Matrix
     errors: Matrix
-    chi2: NDArray[np.float64]
+    chi2: Vector
     cost: float
 
 
@@ -47,7 +46,7 @@ class Minimum:
     """
 
     estimate: Evaluation
-    weights: NDArray[np.float64]
+    weights: Vector
     iterations: int
     converged: bool
     reason: str
@@ -58,9 +57,7 @@ class Minimum:
 class Minimizer:
     """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of robust ones, always with the same step rule."""
 
-    def __init__(
-        self, problem: GraphProblem, optimizer: Optimizer, limits: Limits, shares: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, problem: GraphProblem, optimizer: Optimizer, limits: Limits, shares: Vector) -> None:
         """Shares (E,), as of ``limit_shares``, are the units of χ² of the edges in the truncated loss."""
         self.problem, self.limits, self.shares = problem, limits, shares
         self.optimizer: Optimizer = optimizer
@@ -77,17 +74,17 @@ class Minimizer:
         """The same poses with the cost under another loss."""
         return Evaluation(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
 
-    def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
+    def restricted(self, kept: Mask) -> Minimizer:
         """The same minimizer for a subset of the edges, kept (E,)."""
         return Minimizer(self.problem.restricted(kept), self.optimizer, self.limits, self.shares[kept])
 
-    def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
+    def weights(self, chi2: Vector, loss: Loss) -> Vector:
         """Robust weight of every edge, (E,); 1 for the quadratic ones."""
         result = np.ones(len(chi2))
         result[self.robust] = loss.weight(chi2[self.robust] / self._units(loss))
         return result
 
-    def graduated(self, chi2: NDArray[np.float64], loss: RobustLoss) -> Iterator[RobustLoss]:
+    def graduated(self, chi2: Vector, loss: RobustLoss) -> Iterator[RobustLoss]:
         """GNC schedule of the loss for edges that begin at these χ² (E,)."""
         return loss.graduated(chi2[self.robust] / self._units(loss))
 
@@ -115,20 +112,19 @@ class Minimizer:
 
         return LocalModel(equations.gradient, diagonal, solve, partial(problem.pattern.multiply, equations.values))
 
-    def _cost(self, chi2: NDArray[np.float64], loss: Loss) -> float:
+    def _cost(self, chi2: Vector, loss: Loss) -> float:
         if loss.kernel == "none" or not len(self.robust):
             return float(chi2.sum())
         of_robust, units = chi2[self.robust], self._units(loss)
         return float(chi2.sum() - of_robust.sum() + (units * loss.loss(of_robust / units)).sum())
 
-    def _units(self, loss: Loss) -> NDArray[np.float64]:
+    def _units(self, loss: Loss) -> Vector:
         """Units (L,) of the χ² of the robust edges in this loss."""
         shares = self.shares[self.robust]
         return shares if loss.kernel == "truncated" else np.ones_like(shares)
 
 
 Optimizer = Literal["gauss-newton", "levenberg-marquardt", "gradient-descent"]
-Vector = NDArray[np.float64]
 
 _MOST_DAMPING = 1e12
 _LEAST_DAMPING = 1e-15

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix
-
-Vector = NDArray[np.float64]
+from scanchain.data import Integers, Mask, Matrix, Vector
 
 FEWEST = 3  # least number of rejected loop edges, none near another, that a drift or a jump must explain
 _SCALE_SIGMA, _TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations of the scale and of the turn per meter
@@ -21,7 +18,7 @@ _MOVES = 3.0  # least length of a motion that may slip, in its standard deviatio
 
 
 @dataclass(frozen=True, slots=True)
-class Loosened:
+class InflatedSegment:
     """A segment of ``count`` odometry edges, in the order of the poses, whose errors exceed their covariance.
 
     In a slip the edges share an error, each along its weakest direction; in a jump one edge is entirely wrong.
@@ -36,9 +33,9 @@ class Loosened:
         """Its edges among those of odometry, in the order of the poses."""
         return slice(self.first, self.first + self.count)
 
-    def spread(self, measured: Matrix, information: Matrix) -> Matrix:
+    def error_twists(self, measured: Matrix, information: Matrix) -> Matrix:
         """Twists (count, k, p) of its edges by one standard deviation of each of p errors, from all odometry."""
-        return spread(measured[self.edges], information[self.edges], is_jump=self.is_jump) / self.count
+        return error_twists(measured[self.edges], information[self.edges], is_jump=self.is_jump) / self.count
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +44,11 @@ class Explanation:
 
     drift : (2,) or (4,) share of the path by which odometry is too short, and radians per meter that it turns too
         little
-    loosened : slips and jumps, segments of odometry with inflated covariance
+    inflated : slips and jumps, segments of odometry with inflated covariance
     """
 
     drift: Vector
-    loosened: tuple[Loosened, ...] = ()
+    inflated: tuple[InflatedSegment, ...] = ()
 
     @classmethod
     def none(cls, freedom: int) -> Explanation:
@@ -59,19 +56,19 @@ class Explanation:
         return cls(np.zeros(2 if freedom == 3 else 4))
 
     def applied(
-        self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_odometry: NDArray[np.bool_]
+        self, edges: Integers, measured: Matrix, information: Matrix, is_odometry: Mask
     ) -> tuple[Matrix, Matrix]:
         """Measurements (E, d+1, d+1) without drift, and their information (E, k, k), reduced in slips and jumps.
 
         The noise of a motion scales with its corrected length: with unscaled noise, a shortened motion would fit
         better merely because its noise is shortened as well.
         """
-        if not self.drift.any() and not self.loosened:
+        if not self.drift.any() and not self.inflated:
             return measured, information
         odometry = odometry_of(edges, is_odometry)
         of_odometry, Z = information[odometry], measured[odometry]
-        for segment in self.loosened:
-            twists = segment.spread(Z, information[odometry])
+        for segment in self.inflated:
+            twists = segment.error_twists(Z, information[odometry])
             of_odometry[segment.edges] = _inflated(of_odometry[segment.edges], twists)
         if self.drift[0]:
             scale = lie.by_component(information.shape[-1], 1.0 / (1.0 + self.drift[0]), 1.0)
@@ -83,8 +80,8 @@ class Explanation:
 
     def with_later(self, other: Explanation, before: int) -> Explanation:
         """The same plus the slips and jumps of another, whose odometry edges follow the first ``before`` ones."""
-        later = (replace(segment, first=segment.first + before) for segment in other.loosened)
-        return replace(self, loosened=(*self.loosened, *later))
+        later = (replace(segment, first=segment.first + before) for segment in other.inflated)
+        return replace(self, inflated=(*self.inflated, *later))
 
     def cost(self, measured: Matrix, information: Matrix, price: float, nominal: float) -> float:
         """Cost of the explanation itself, where a rejected loop edge costs this price; the arrays are of odometry.
@@ -93,15 +90,13 @@ class Explanation:
         """
         result = float((self.drift**2 * prior(len(self.drift))).sum())
         result += FEWEST * price if self.drift.any() else 0.0
-        for segment in self.loosened:
-            B = segment.spread(measured, information)
+        for segment in self.inflated:
+            B = segment.error_twists(measured, information)
             claimed = (np.swapaxes(B, 1, 2) @ information[segment.edges] @ B).sum(axis=0)
             result += float(cost_of(claimed, is_jump=segment.is_jump, price=price, nominal=nominal))
         return result
 
-    def lines(
-        self, ends: NDArray[np.int64], noun: str, errors: Matrix, measured: Matrix, information: Matrix
-    ) -> list[str]:
+    def lines(self, ends: Integers, noun: str, errors: Matrix, measured: Matrix, information: Matrix) -> list[str]:
         """The corrections as text, one line each.
 
         ends (O, 2), noun : displayed numbers of the poses that odometry joins, and the noun for them, as "scans"
@@ -112,8 +107,8 @@ class Explanation:
             scale, *turns = self.drift.tolist()
             turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
             found.append(f"length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
-        for segment in sorted(self.loosened, key=lambda each: each.is_jump):
-            along = segment.spread(measured, information)[..., 0] * (segment.count / _SLIP_SIGMA_M)
+        for segment in sorted(self.inflated, key=lambda each: each.is_jump):
+            along = segment.error_twists(measured, information)[..., 0] * (segment.count / _SLIP_SIGMA_M)
             size_m = float((along * errors[segment.edges]).sum())
             what = "a jump" if segment.is_jump else f"a slip of {size_m:+.1f} m"
             poses = ends[segment.edges]
@@ -121,13 +116,13 @@ class Explanation:
         return [f"corrected by loop closures: {what}" for what in found]
 
 
-def odometry_of(edges: NDArray[np.int64], is_odometry: NDArray[np.bool_]) -> NDArray[np.int64]:
+def odometry_of(edges: Integers, is_odometry: Mask) -> Integers:
     """Edges of odometry (O,), in the order of the poses."""
     odometry = np.flatnonzero(is_odometry)
     return odometry[np.argsort(edges[odometry].min(axis=1), kind="stable")]
 
 
-def direction(edges: NDArray[np.int64]) -> Vector:
+def direction(edges: Integers) -> Vector:
     """1 for edges (O, 2) to a later pose, −1 for those to an earlier one."""
     return np.sign(edges[:, 1] - edges[:, 0]).astype(np.float64)
 
@@ -152,7 +147,7 @@ def prior(count: int) -> Vector:
     return np.array([_SCALE_SIGMA] + (count - 1) * [_TURN_SIGMA_RAD_M]) ** -2.0
 
 
-def spread(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
+def error_twists(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
     """Twists (E, k, p) of edges by one standard deviation of each of p errors, all of it on that edge.
 
     A slip is along the weakest direction of translation, or along the motion where none is weak. It is zero where

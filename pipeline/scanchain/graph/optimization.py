@@ -6,23 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain.config import GraphConfig
-from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, brief, fit_text
+from scanchain.data import REJECTED_WEIGHT, GraphState, Integers, Mask, Matrix, Vector, brief, fit_text
 from scanchain.errors import counted
 from scanchain.graph.consistency import Consistency, agreeing_groups
 from scanchain.graph.edge_checks import has_loop, is_connected
 from scanchain.graph.factors import ORIGIN
 from scanchain.graph.initialize import Initialization, first_guess
-from scanchain.graph.losses import (
-    InlierSet,
-    RobustLoss,
-    fair_price,
-    limit_shares,
-    rejection_limit,
-    robust_loss,
-)
+from scanchain.graph.losses import InlierSet, RobustLoss, fair_price, limit_shares, rejection_limit, robust_loss
 from scanchain.graph.minimizer import Evaluation, Limits, Loss, Minimizer, Minimum
 from scanchain.graph.problem import GraphProblem
 
@@ -92,7 +84,7 @@ class Optimization:
     time_s: float
 
     @property
-    def rejected(self) -> NDArray[np.bool_]:
+    def rejected(self) -> Mask:
         """Edges (E,), in the order of ``state.edges``, with a robust loss that contradict the rest.
 
         Such edges are loops, ``RobustPrior``, ``RobustPosition`` and custom factors with ``is_robust``.
@@ -238,7 +230,7 @@ def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: 
     return replace(minimum, price=price)
 
 
-def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.float64], price: float) -> Minimum:
+def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: Vector, price: float) -> Minimum:
     """The minimum after rounds that accept or reject single edges, as long as the cost falls.
 
     against : (L,) as of ``_against``
@@ -288,7 +280,7 @@ def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: 
 
 def _next_group(
     minimizer: Minimizer, minimum: Minimum, price: float, limit: float, tried: set[tuple[int, ...]]
-) -> NDArray[np.int64]:
+) -> Integers:
     """The group whose change promises the largest decrease of the cost; empty if no group of edges is rejected."""
     problem, poses = minimizer.problem, minimum.estimate.poses
     kept = minimum.weights > 0.5
@@ -312,7 +304,7 @@ def _next_group(
     return best
 
 
-def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
+def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> Vector:
     """Distance of every robust edge from all other edges, (L,), as of ``Consistency``."""
     kept = minimum.weights > 0.5
     return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.robust]
@@ -343,7 +335,7 @@ def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) 
     return replace(best, iterations=used + trial.iterations)
 
 
-def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Since) -> list[NDArray[np.int64]]:
+def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Since) -> list[Integers]:
     """Rejected new edges that lower the cost to first order, alone or as groups that agree."""
     problem, poses, kept = minimizer.problem, minimum.estimate.poses, minimum.weights > 0.5
     left_out = problem.is_robust & ~kept

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import GraphConfig
-from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
+from scanchain.data import REJECTED_WEIGHT, GraphState, Integers, Mask, Matrix, Pose, Vector
 from scanchain.errors import InputError, counted
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
@@ -40,7 +40,7 @@ from scanchain.graph.factors import (
 )  # fmt: skip
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
-from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
+from scanchain.graph.odometry_errors import Explanation, InflatedSegment, corrected, odometry_of
 from scanchain.graph.optimization import Optimization, Rejection, Since
 from scanchain.graph.problem import GraphProblem
 
@@ -55,7 +55,7 @@ class PoseGraph:
     refer to the origin of the world, by the origin.
     """
 
-    def __init__(self, dimension: int, names: NDArray[np.int64] | None = None, left_out: str = "") -> None:
+    def __init__(self, dimension: int, names: Integers | None = None, left_out: str = "") -> None:
         """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses with these names in messages.
 
         left_out : constraints that the graph lacks, as text for the certificate
@@ -70,6 +70,9 @@ class PoseGraph:
         self._factors: list[Factor] = list(FACTORS)
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
+        self._of_edges = (
+            self._edges, self._measurements, self._information, self._kind, self._rank, self._weight,
+        )  # fmt: skip
         self._fixed: set[int] = set()
         self.since = Since(0, 0)
         self.work = 0.0  # multiplications that the factorizations of the last optimization took
@@ -92,7 +95,7 @@ class PoseGraph:
         return self._poses.rows
 
     @property
-    def names(self) -> NDArray[np.int64]:
+    def names(self) -> Integers:
         """Name of every pose in messages, (K,); without names given, its index."""
         if self._names is None:
             return np.arange(len(self))
@@ -100,12 +103,12 @@ class PoseGraph:
         return np.append(self._names, self._names.max(initial=-1) + 1 + np.arange(more))[: len(self)]
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> Integers:
         """Stamp of every pose, (K,)."""
         return self._stamps_ns.rows
 
     @property
-    def edges(self) -> NDArray[np.int64]:
+    def edges(self) -> Integers:
         """Pose pairs (i, j), (E, 2), in the order they were added; i is ``ORIGIN``, −1, of factors of one pose."""
         return self._edges.rows
 
@@ -115,7 +118,7 @@ class PoseGraph:
         return self._applied(self._explanation)[0]
 
     @property
-    def drift(self) -> NDArray[np.float64]:
+    def drift(self) -> Vector:
         """Odometry drift inferred from loop edges, (2,) or (4,): the share by which it is too short, missing turn.
 
         A pure number, and radians per meter about every axis; zero if loop edges show no drift.
@@ -123,13 +126,13 @@ class PoseGraph:
         return self._explanation.drift
 
     @property
-    def loosened(self) -> tuple[Loosened, ...]:
+    def inflated(self) -> tuple[InflatedSegment, ...]:
         """Slips and jumps: segments of odometry whose errors, by loop edges, exceed their covariance."""
-        return self._explanation.loosened
+        return self._explanation.inflated
 
-    def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
+    def corrections(self, names: Integers, noun: str = "poses") -> list[str]:
         """Drift, slips and jumps as text, one line each; ``names`` (K,) are the displayed numbers of the poses."""
-        if not self.drift.any() and not self.loosened:
+        if not self.drift.any() and not self.inflated:
             return []
         odometry = odometry_of(self.edges, self.is_odometry)
         errors = self._prepared().errors(self._vertices)[odometry]
@@ -145,7 +148,7 @@ class PoseGraph:
         """``measurements`` and ``information`` of this edge and all later ones, without all others if possible."""
         explanation, new = self._explanation, slice(first, None)
         before = int(self.is_odometry[:first].sum())
-        if any(segment.edges.stop > before for segment in explanation.loosened):
+        if any(segment.edges.stop > before for segment in explanation.inflated):
             return self.measurements[new], self.information[new]
         drift = Explanation(explanation.drift)
         return drift.applied(
@@ -153,42 +156,42 @@ class PoseGraph:
         )
 
     @property
-    def is_loop(self) -> NDArray[np.bool_]:
+    def is_loop(self) -> Mask:
         """True for every loop edge, (E,)."""
         return np.isin(self._kind.rows, LOOPS)
 
     @property
-    def is_odometry(self) -> NDArray[np.bool_]:
+    def is_odometry(self) -> Mask:
         """True for every edge of odometry, (E,)."""
         return self._kind.rows == ODOMETRY
 
     @property
-    def is_of_origin(self) -> NDArray[np.bool_]:
+    def is_of_origin(self) -> Mask:
         """True for every unary edge, which constrains one pose only, (E,)."""
         return self.edges[:, 0] == ORIGIN
 
     @property
-    def is_custom(self) -> NDArray[np.bool_]:
+    def is_custom(self) -> Mask:
         """True for every edge of a factor that is not of this package, (E,)."""
         return self._kind.rows >= len(FACTORS)
 
     @property
-    def weight(self) -> NDArray[np.float64]:
+    def weight(self) -> Vector:
         """Weight of every edge after the last optimization, (E,); 1 before any."""
         return self._weight.rows
 
     @property
-    def is_rejected(self) -> NDArray[np.bool_]:
+    def is_rejected(self) -> Mask:
         """True for every edge that the last optimization rejected, (E,)."""
         return self.weight < REJECTED_WEIGHT
 
     @property
-    def is_point(self) -> NDArray[np.bool_]:
+    def is_point(self) -> Mask:
         """True for every pose that is a point, without a heading, (K,)."""
         return self._is_point.rows
 
     @property
-    def fixed(self) -> NDArray[np.bool_]:
+    def fixed(self) -> Mask:
         """True for every fixed pose, (K,); without any by ``fix`` or information on a single pose, pose 0."""
         result = np.zeros(len(self), np.bool_)
         result[sorted(self._fixed) or slice(0, 0 if self._rank.rows[self.is_of_origin].any() else 1)] = True
@@ -203,7 +206,7 @@ class PoseGraph:
         """Index of the new pose, which is added with this initial guess."""
         return self._append(checks.pose(T_world, "T_world", self.dimension), stamp_ns, is_point=False)
 
-    def add_point(self, position: NDArray[np.float64], stamp_ns: int) -> int:
+    def add_point(self, position: Vector, stamp_ns: int) -> int:
         """Index of a new point of the plane (2,): it counts among the poses, with the identity as its rotation."""
         if self.dimension != 2:
             raise InputError("a point of the plane was added to a graph of SE(3) poses; make it PoseGraph(2)")
@@ -255,9 +258,7 @@ class PoseGraph:
             self._factors.append(factor)
         self._extend(*edge, np.array([kind]))
 
-    def add_edges(
-        self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
-    ) -> None:
+    def add_edges(self, edges: Integers, measurements: Matrix, information: Matrix, is_loop: Mask) -> None:
         """Add many edges: (E, 2), (E, d+1, d+1), (E, k, k), (E,)."""
         edges = checks.indices(edges, "edges")
         measurements = checks.poses(measurements, "measurements", self.dimension)
@@ -270,29 +271,20 @@ class PoseGraph:
             )
         self._add_edges(edges, measurements, information, is_loop)
 
-    def _add_edges(
-        self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
-    ) -> None:
+    def _add_edges(self, edges: Integers, measurements: Matrix, information: Matrix, is_loop: Mask) -> None:
         check_edges(edges, measurements, information, len(self))
         self._extend(edges, measurements, information, kinds_of(edges, information, self.is_point, is_loop))
 
-    def _extend(
-        self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, kind: NDArray[np.int64]
-    ) -> None:
+    def _extend(self, edges: Integers, measurements: Matrix, information: Matrix, kind: Integers) -> None:
         self._changed()
-        self._edges.extend(edges)
-        self._measurements.extend(measurements)
-        self._information.extend(information)
-        self._rank.extend(ranks(information))
-        self._kind.extend(kind)
-        self._weight.extend(np.ones(len(edges)))
+        rows = edges, measurements, information, kind, ranks(information), np.ones(len(edges))
+        for column, new in zip(self._of_edges, rows, strict=True):
+            column.extend(new)
 
-    def remove_loops(self, is_removed: NDArray[np.bool_]) -> None:
+    def remove_loops(self, is_removed: Mask) -> None:
         """Remove loop edges; is_removed (E,) is True for each edge to remove."""
         self._changed()
-        for column in (
-            self._edges, self._measurements, self._information, self._rank, self._kind, self._weight,
-        ):  # fmt: skip
+        for column in self._of_edges:
             column.replace(column.rows[~is_removed])
         self.since = Since(0, 0)
 
@@ -407,7 +399,7 @@ class PoseGraph:
         result._explanation = Explanation.none(self.freedom)
         return result
 
-    def take_over(self, optimized: PoseGraph) -> None:
+    def adopt(self, optimized: PoseGraph) -> None:
         """Adopt the result of optimizing a ``copy``; poses added since move with the last one before them."""
         count, edges = len(optimized), len(optimized.edges)
         T_new_old = optimized.poses[-1] @ lie.inverse(self.poses[count - 1])
@@ -422,12 +414,12 @@ class PoseGraph:
         graph = self._prepared(), self._vertices, self._weight_in_force
         return replace(certify(*graph, self._undetermined(), self.names), left_out=self.left_out)
 
-    def free_poses(self) -> NDArray[np.int64]:
+    def free_poses(self) -> Integers:
         """Names of the poses that the edges in force leave free in some direction, at the current poses."""
         self._factor_is_now = False
         return free_poses(self._prepared(), self._vertices, self._weight_in_force, self._rank.rows, self.names)
 
-    def weakly_joined(self) -> NDArray[np.int64]:
+    def weakly_joined(self) -> Integers:
         """Names of the poses joined to a fixed one only by edges in force with almost no information."""
         kept = ~self.is_rejected
         information = self.weight[kept, None, None] * self.information[kept]
@@ -477,7 +469,7 @@ class PoseGraph:
         result[problem.free] = inverse_blocks(problem)[: len(problem.free)]
         return result
 
-    def pose_errors(self, count: int, seed: int = 0) -> NDArray[np.float64]:
+    def pose_errors(self, count: int, seed: int = 0) -> Matrix:
         """Errors (count, K, k) of all poses, sampled from their joint distribution by the edges in force.
 
         They are of position and orientation, along the world's axes. Raises InputError where the edges leave poses
@@ -486,7 +478,7 @@ class PoseGraph:
         count = checks.integer(count, "count", "a number of samples, 1 or more", least=1)
         return pose_errors(self._factored(), self._vertices, count, seed)[:, : len(self)]
 
-    def displacements(self, changes: Matrix) -> NDArray[np.float64]:
+    def displacements(self, changes: Matrix) -> Matrix:
         """First-order changes (G, K, k) of all poses when the measured motions T_ij become T_ij exp(change).
 
         changes : (G, E, k) twists. The result is in position and orientation, along the world's axes. Raises
@@ -546,7 +538,7 @@ class PoseGraph:
         free = self.free_poses()
         return free_text(free) if len(free) else ""
 
-    def _singular(self, error: SingularMatrixError, fixed: NDArray[np.bool_]) -> InputError:
+    def _singular(self, error: SingularMatrixError, fixed: Mask) -> InputError:
         """The error for poses that their edges leave free, or nearly free."""
         variable = np.flatnonzero(~fixed)[[error.variable]]
         return _refused(self._undetermined() or free_text(self.names[variable]))
@@ -561,15 +553,15 @@ class PoseGraph:
         return self._of_vertices(self.poses, of_origin=lie.identity(self.dimension))
 
     @property
-    def _fixed_vertices(self) -> NDArray[np.bool_]:
+    def _fixed_vertices(self) -> Mask:
         return self._of_vertices(self.fixed, of_origin=True)
 
     @property
-    def _is_point_vertex(self) -> NDArray[np.bool_]:
+    def _is_point_vertex(self) -> Mask:
         return self._of_vertices(self.is_point, of_origin=False)
 
     @property
-    def _joined(self) -> NDArray[np.int64]:
+    def _joined(self) -> Integers:
         """Pairs of vertices that the edges join, (E, 2)."""
         return np.where(self.edges == ORIGIN, len(self), self.edges) if self._has_origin else self.edges
 
@@ -578,10 +570,10 @@ class PoseGraph:
         return np.concatenate([of_poses, np.asarray(of_origin)[None]]) if self._has_origin else of_poses
 
     @property
-    def _weight_in_force(self) -> NDArray[np.float64]:
+    def _weight_in_force(self) -> Vector:
         return self.weight * ~self.is_rejected
 
-    def _in_force(self, chi2: NDArray[np.float64]) -> float:
+    def _in_force(self, chi2: Vector) -> float:
         """The sum of w χ² over the edges in force; χ² (E,)."""
         return float((self.weight * chi2)[~self.is_rejected].sum())
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix
+from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
 from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, SIGHTINGS, WHOLE, Factor, kinds_of, read_only
 from scanchain.kernels.graph import between
@@ -20,8 +19,8 @@ from scanchain.kernels.graph import between
 class NormalEquations:
     """H = Σ w JᵀΩJ as block values of the problem's pattern, and g = Σ w JᵀΩe; the step solves H ξ = −g."""
 
-    values: NDArray[np.float64]
-    gradient: NDArray[np.float64]
+    values: Vector
+    gradient: Vector
 
 
 class GraphProblem:
@@ -32,16 +31,20 @@ class GraphProblem:
     ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
 
     A pose may be a point of the plane: its rotation is the identity, and its block holds the translation alone.
+
+    Kinds of edges, (E,) bool each: ``is_odometry``; ``is_loop``; ``is_whole``, of position and rotation;
+    ``is_sighting``, of a position seen from a pose; ``is_robust``, with the robust loss; ``is_bounded``, for whose
+    χ² the certificate has a lower bound.
     """
 
     def __init__(
         self,
-        edges: NDArray[np.int64],
+        edges: Integers,
         measurements: Matrix,
         information: Matrix,
-        fixed: NDArray[np.bool_],
-        is_point: NDArray[np.bool_] | None = None,
-        kind: NDArray[np.int64] | None = None,
+        fixed: Mask,
+        is_point: Mask | None = None,
+        kind: Integers | None = None,
         factors: Sequence[Factor] = FACTORS,
     ) -> None:
         """Edges (E, 2) pairs (i, j), Z (E, d+1, d+1) measurements, Ω (E, k, k); fixed, is_point (K,).
@@ -67,6 +70,9 @@ class GraphProblem:
         if kind is None:
             kind = kinds_of(edges, information, self.is_point)
         self.kind, self.factors = kind, factors
+        self.is_odometry, self.is_bounded = kind == ODOMETRY, kind < len(FACTORS)
+        self.is_loop, self.is_whole, self.is_sighting = (np.isin(kind, each) for each in (LOOPS, WHOLE, SIGHTINGS))
+        self.is_robust = np.array([factor.is_robust for factor in factors], np.bool_)[kind]
         self._by_factor = [(factors[each], np.flatnonzero(kind == each)) for each in np.unique(kind).tolist()]
         sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
@@ -77,48 +83,18 @@ class GraphProblem:
         """The solver; analyzed when it is first needed."""
         return SparseCholesky(self.pattern, analyze(self.pattern))
 
-    def restricted(self, kept: NDArray[np.bool_]) -> GraphProblem:
-        """The problem of the same poses with some of its edges, kept (E,)."""
+    def restricted(self, kept: Mask, fixed: Mask | None = None) -> GraphProblem:
+        """The problem of the same poses with some of its edges, kept (E,); fixed (K,) are by default the same."""
         edges, measurements, information = self.edges[kept], self.measurements[kept], self.information[kept]
-        fixed, kind = self.variable < 0, self.kind[kept]
-        return GraphProblem(edges, measurements, information, fixed, self.is_point, kind, self.factors)
-
-    @cached_property
-    def is_robust(self) -> NDArray[np.bool_]:
-        """True for every edge with the robust loss, (E,)."""
-        return np.array([factor.is_robust for factor in self.factors], np.bool_)[self.kind]
+        fixed = self.variable < 0 if fixed is None else fixed
+        return GraphProblem(edges, measurements, information, fixed, self.is_point, self.kind[kept], self.factors)
 
     @property
-    def residuals(self) -> NDArray[np.int64]:
+    def residuals(self) -> Integers:
         """Number of residuals of every edge that have information, (E,)."""
         return np.count_nonzero(np.einsum("eaa->ea", self.information), axis=1)
 
-    @property
-    def is_bounded(self) -> NDArray[np.bool_]:
-        """True for every edge for whose χ² the certificate has a lower bound, (E,)."""
-        return self.kind < len(FACTORS)
-
-    @property
-    def has_landmarks(self) -> bool:
-        """Whether some edge measures a position seen from a pose."""
-        return bool(np.isin(self.kind, SIGHTINGS).any())
-
-    @property
-    def is_loop(self) -> NDArray[np.bool_]:
-        """True for every loop edge, (E,)."""
-        return np.isin(self.kind, LOOPS)
-
-    @property
-    def is_odometry(self) -> NDArray[np.bool_]:
-        """True for every edge of odometry, (E,)."""
-        return self.kind == ODOMETRY
-
-    @property
-    def is_whole(self) -> NDArray[np.bool_]:
-        """True for every edge that measures position and rotation, (E,)."""
-        return np.isin(self.kind, WHOLE)
-
-    def factored(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> GraphProblem:
+    def factored(self, poses: Matrix, errors: Matrix, kept: Mask) -> GraphProblem:
         """The problem of some of the edges, kept (E,), with H factored at these poses and their errors (E, k).
 
         The factor of this problem is released: two factors of a long log would dominate the memory.
@@ -136,7 +112,7 @@ class GraphProblem:
             errors[of] = factor.residual(poses, self.edges[of], self.measurements[of])
         return errors
 
-    def chi2(self, errors: Matrix) -> NDArray[np.float64]:
+    def chi2(self, errors: Matrix) -> Vector:
         """Return eᵀΩe of every edge, (E,)."""
         result = np.empty(len(errors))
         between.squared_norms(errors, self.information, result)
@@ -149,7 +125,7 @@ class GraphProblem:
             jacobian[of] = factor.linearize(poses, self.edges[of], self.measurements[of], errors[of])
         return jacobian
 
-    def linearize(self, poses: Matrix, errors: Matrix, weights: NDArray[np.float64]) -> NormalEquations:
+    def linearize(self, poses: Matrix, errors: Matrix, weights: Vector) -> NormalEquations:
         """Normal equations at these poses, with these residuals and robust weights (E,)."""
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))
@@ -157,7 +133,7 @@ class GraphProblem:
         between.scatter_between(
             jacobian, errors, self.information, read_only(weights), self.slots, blocks, gradient
         )
-        return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient))
+        return NormalEquations(self.packing.values(blocks), self.packing.packed(gradient))
 
     def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:
         """Blocks (B, b, b) of the pattern, summed over what every edge adds (E, b, b) for i, j and the pair.
@@ -171,8 +147,8 @@ class GraphProblem:
             np.add.at(blocks, slot[slot >= 0], added[slot >= 0])
         return blocks
 
-    def moved(self, poses: Matrix, step: NDArray[np.float64]) -> Matrix:
+    def moved(self, poses: Matrix, step: Vector) -> Matrix:
         """Poses after left twists: exp(ξ) T of every free pose; step (scalars of the pattern,)."""
         result = poses.copy()
-        result[self.free] = lie.exp(self.packing.spread_rows(step)) @ poses[self.free]
+        result[self.free] = lie.exp(self.packing.unpacked(step)) @ poses[self.free]
         return result

@@ -18,7 +18,7 @@ LAG = 200  # number of the last poses, which are updated where updating all is t
 _LARGE = 2000  # largest number of poses judged together; from this number, live logs are optimized in a thread
 _WORK_PER_KEYFRAME = 1e6  # largest number of multiplications to update all poses, per keyframe since the last time
 _CONTRADICTING = 10.0  # factor on the χ² limit of a loop edge, above which a closure contradicts the graph
-_TAKEN_AFTER = {"update": 0.005, "judge": 0.1}  # keyframes until a result is adopted, per pose moved
+_ADOPTED_AFTER = {"update": 0.005, "judge": 0.1}  # keyframes until a result is adopted, per pose moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class Schedule:
         self.optimized_at = self.updated_at = self.judged_at = 0  # poses at the last optimization, of all, judged
         self.background: BackgroundOptimization | None = None
 
-    def note(self, source: int, moves_m: float, chi2: float, *, joins: bool = False) -> None:
+    def record_closure(self, source: int, moves_m: float, chi2: float, *, joins: bool = False) -> None:
         """Record an added closure: its newer pose, how far it may move the map, and its χ² before optimization.
 
         joins : whether it is the first to join a segment, which was moved to the pose it measures
@@ -108,7 +108,7 @@ class Schedule:
         """
         count = len(self.graph)
         if self.background is not None and count >= self.background.due:
-            return self.take_over()
+            return self.adopt()
         if self.joins:
             return self.optimize()
         if not self.waits:
@@ -120,7 +120,7 @@ class Schedule:
         self.waits, self.moves, self.optimized_at = False, False, count
         if is_live and count >= _LARGE and plan != self._of_end:
             self._begin_waiting(plan)
-            due = count + max(int(_TAKEN_AFTER[plan.rejection] * (count - plan.first)), _LEAST)
+            due = count + max(int(_ADOPTED_AFTER[plan.rejection] * (count - plan.first)), _LEAST)
             self.background = BackgroundOptimization(self.graph, self.config, plan, due)
             return count
         self._carry_out(plan)
@@ -141,13 +141,13 @@ class Schedule:
     def finish(self) -> GraphState:
         """Optimize for the last time, with all closures judged again; the resulting graph."""
         if self.background is not None:
-            self.take_over()
+            self.adopt()
         return self.graph.optimize(self.config, initialize="given").state
 
-    def take_over(self) -> int:
+    def adopt(self) -> int:
         """Adopt the result of the background optimization; 0, the first pose that moves."""
         assert self.background is not None
-        self.graph.take_over(self.background.result())
+        self.graph.adopt(self.background.result())
         self.background = None
         self._count_excess()
         return 0
