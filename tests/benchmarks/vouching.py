@@ -11,7 +11,7 @@ real log, of at most 5 s. It is
             than three standard deviations along the error. These are of ``covariance`` in steps.parquet, that of a
             match in the lidar's frame; both ends err: Σ = Σ_j + Ad(M⁻¹) Σ_i Ad(M⁻¹)ᵀ with M the motion. Where one
             is null (degenerate) nothing is claimed, and the limits in meters and degrees decide alone
-  flagged   if one of its scans is not ``ok`` or lies in a stretch of the verdict
+  flagged   if one of its scans is not ``ok`` or lies in a segment of the verdict
   open      if the true geometry leaves a direction open: less than a thousandth of the returns speak about it.
             Right motions of this sort are not counted, flagged or not. Real logs do not say
 
@@ -115,8 +115,8 @@ def judged(case: Case, cache: Path, out: Path) -> Row:
     if np.isinf(case.log.reference_m):  # good enough for the run as a whole alone
         motions = Motions(*(part[:0] for part in motions))
     flags = np.array(steps["state"].to_pylist()) != "ok"
-    for stretch in verdict.stretches:
-        flags[stretch.first : stretch.last + 1] = True
+    for segment in verdict.segments:
+        flags[segment.first : segment.last + 1] = True
     wrong, flagged = _is_wrong(motions, steps, evidence.poses, case.log), _any(flags, motions)
     is_open = _is_open(case.log.open_shares(cache), trajectory.stamps_ns, motions)
     quality = "good but wrong motions" if quality[0] == "good" and wrong.any() else quality[0], quality[1]
@@ -272,7 +272,7 @@ def _is_missed(row: Row) -> bool:
 
 
 def _is_doubted(row: Row) -> bool:
-    allowed = ("trustworthy", "check these stretches") if row["is_open"] else ("trustworthy",)
+    allowed = ("trustworthy", "check these segments") if row["is_open"] else ("trustworthy",)
     return row["quality"] == "good" and row["verdict"] not in allowed
 
 

@@ -66,10 +66,10 @@ def test_a_run_of_the_office_is_trustworthy_and_so_is_its_true_trajectory_but_no
 ):
     run = ran(office, "--strict")
     metrics = run.metrics
-    assert run.code == 0 and metrics["verdict"] == "trustworthy" and metrics["stretches"] == []
+    assert run.code == 0 and metrics["verdict"] == "trustworthy" and metrics["segments"] == []
     code, output, _ = call("check", run.folder, "--json")
     assert code == 0 and json.loads(output) == {
-        name: metrics[name] for name in ("verdict", "verdict_error", "verdict_reason", "stretches")
+        name: metrics[name] for name in ("verdict", "verdict_error", "verdict_reason", "segments")
     }
     expected = metrics["expected_ate_m"]
     low, high = map(float, re.fullmatch(r"ATE ([\d.]+) to ([\d.]+) m", metrics["verdict_error"]).groups())
@@ -106,7 +106,7 @@ def test_a_run_without_a_directory_gets_one_by_its_log_with_a_number_where_that_
 
 
 def test_a_terminal_shows_three_reasons_and_how_many_more_there_are():
-    head = list(verdict_lines("check these stretches", ["a " * 60, "b", "c", "d", "e"]))
+    head = list(verdict_lines("check these segments", ["a " * 60, "b", "c", "d", "e"]))
     assert shortened("\n".join([*head, "log.mcap", "   5 %"]) + "\n") == (
         "\n".join([*(line.rstrip() for line in head[:4]), f"{REASON}2 more in summary.txt", "log.mcap", "   5 %"])
         + "\n"

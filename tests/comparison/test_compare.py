@@ -436,7 +436,7 @@ def test_an_error_bar_that_the_truth_refutes_is_not_trustworthy(office, tmp_path
     stretched[:, :3, 3] *= 2.0
     write_tum(tmp_path / "wrong.tum", Trajectory(truth.stamps_ns, stretched))
     (row,) = run(office, tmp_path, "plicp", ground_truth=tmp_path / "wrong.tum").rows
-    assert row.verdict == "check these stretches" and row.verdict_error == ""
+    assert row.verdict == "check these segments" and row.verdict_error == ""
     assert row.verdict_reason.startswith("the ground truth refutes ATE 0.0")
     assert row.verdict_reason.endswith(f" m: ATE {row.figures['ate_m']:.4f} m")
 

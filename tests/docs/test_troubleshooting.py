@@ -75,7 +75,7 @@ def test_wheels_hold_the_poses_along_corridors_that_a_short_range_leaves_degener
         metrics_of(log, tmp_path / prior, preprocess__max_range_m=4.0, odometry__prior=prior)
         for prior in ("constant-velocity", "auto")
     )
-    assert (without.verdict, with_wheels.verdict) == ("not trustworthy", "check these stretches")
+    assert (without.verdict, with_wheels.verdict) == ("not trustworthy", "check these segments")
     assert "wheels disagree" in without.verdict_reason
     for metrics in (without, with_wheels):
         assert metrics.degenerate > 0.4 * metrics.scans

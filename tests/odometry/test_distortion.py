@@ -82,7 +82,7 @@ def test_times_that_are_ignored_are_named_with_the_distortion_and_the_flag():
 def test_a_run_whose_scans_remain_distorted_is_to_be_checked_and_so_says_its_directory(tmp_path):
     log = made.log("town", seconds=SECONDS, sensor="os1-32")
     done = scanchain.run(log, tmp_path / "run", recording=False, log__point_times="none")
-    assert done.metrics.verdict == "check these stretches" and "distorted by up to" in done.metrics.verdict_reason
+    assert done.metrics.verdict == "check these segments" and "distorted by up to" in done.metrics.verdict_reason
     assert judge_run(tmp_path / "run").sentence == done.metrics.sentence
 
 

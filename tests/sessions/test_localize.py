@@ -54,7 +54,7 @@ def test_a_log_is_followed_in_the_map_from_a_rough_pose(office, tmp_path, call):
     error_m = np.linalg.norm(live - true[where][known][:, :2, 2], axis=1)
     assert (error_m < 5.0 * np.array(table["sigma_m"])[known]).mean() > 0.95
     html = (tmp_path / "loc/report.html").read_text()
-    assert "Stretches without the map" in html and "Stretches to check" not in html
+    assert "Segments without the map" in html and "Segments to check" not in html
     for name in ("report.html", "recording.rrd", "summary.txt", "config.toml", "run.json"):
         assert (tmp_path / "loc" / name).stat().st_size > 100, name
     metrics = json.loads((tmp_path / "loc/metrics.json").read_text())

@@ -320,7 +320,7 @@ def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tm
         ["simulate", "office", str(tmp_path / "a.mcap"), "--duration", "60", "--wheels-slip", "20", "24", "6"]
     )
     metrics = scanchain.run(tmp_path / "a.mcap", tmp_path / "run", recording=False).metrics
-    assert code == 0 and metrics.verdict == "trustworthy" and metrics.stretches == ()
+    assert code == 0 and metrics.verdict == "trustworthy" and metrics.segments == ()
     start_s, end_s, size_m = map(
         float, re.findall(r"wheels slip at ([\d.]+) to ([\d.]+) s \(([\d.]+) m\)", metrics.verdict_reason)[0]
     )

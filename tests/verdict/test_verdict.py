@@ -13,10 +13,10 @@ from scanchain.errors import at_most
 from scanchain.runs.evidence import evidence_of, evidence_of_trajectory
 from scanchain.runs.step_table import steps_table, write_table
 from scanchain.steps import Steps
-from scanchain.verdict import Closures, Evidence, Kind, Stretch, Verdict, apart_m, judge
+from scanchain.verdict import CHECKS, Check, Closures, Evidence, Kind, Segment, Verdict, apart_m, judge
 from scanchain.verdict.scans import check_overlap, check_velocity
 from scanchain.verdict.wheels import wheel_bound_m
-from scanchain_viz.colors import STRETCH_COLORS
+from scanchain_viz.colors import SEGMENT_COLORS, color_of_kind
 from tests.benchmarks import vouching
 from tests.benchmarks.vouching_logs import Case, LogSpec
 from tests.support.recordings import drive
@@ -70,12 +70,12 @@ def evidence(poses=POSES, *, wheels=None, closures=(), **changes):
         "points": np.full(n, 500),
         "inlier_share": np.ones(n),
         "bound_m": 0.02,
+        "sources": {} if wheels is None else {"wheel": wheels},
     }
     return Evidence(
         stamps_ns=stamps_ns,
         log_times_ns=stamps_ns,
         poses=poses,
-        sources={} if wheels is None else {"wheel": wheels},
         closures=Closures(ends[:, 0], ends[:, 1], T, np.zeros(len(ends), bool)),
         **known | changes,
     )
@@ -91,7 +91,7 @@ def marked(first, last):
 def test_wheels_with_errors_of_scale_heading_and_noise_doubt_nothing(dimension, errors):
     poses, _ = course(dimension)
     judged = judge(evidence(poses, wheels=wheels_of(poses, **errors)))
-    assert judged.verdict is Verdict.TRUSTWORTHY and judged.stretches == ()
+    assert judged.verdict is Verdict.TRUSTWORTHY and judged.segments == ()
     assert "wheels" in judged.reason
 
 
@@ -251,10 +251,10 @@ FOUND = {
 
 
 @pytest.mark.parametrize("case", FOUND)
-def test_a_wrong_or_doubtful_trajectory_is_judged_by_its_stretches_with_a_reason(case):
+def test_a_wrong_or_doubtful_trajectory_is_judged_by_its_segments_with_a_reason(case):
     made, verdict, kinds, words = FOUND[case]
     judged = judge(made())
-    assert judged.verdict is verdict and {each.kind for each in judged.stretches} == kinds
+    assert judged.verdict is verdict and {each.kind for each in judged.segments} == kinds
     assert words in judged.reason
 
 
@@ -262,19 +262,19 @@ def test_a_slip_along_a_corridor_is_named_though_every_scan_is_ok(dimension):
     truth, slipped = course(dimension, slip=(500, 530))
     judged = judge(evidence(slipped, wheels=wheels_of(truth)))
     assert judged.verdict is Verdict.CHECK
-    (stretch,) = judged.stretches
-    assert stretch.kind is Kind.WHEELS and 480 <= stretch.first <= 505 and 525 <= stretch.last <= 550
-    assert 2.0 < stretch.size_m < 3.2 and f"wheels disagree by {stretch.size_m:.1f} m" in judged.sentence
-    assert stretch.start_s == pytest.approx(INTERVAL_S * stretch.first)
+    (segment,) = judged.segments
+    assert segment.kind is Kind.WHEELS and 480 <= segment.first <= 505 and 525 <= segment.last <= 550
+    assert 2.0 < segment.size_m < 3.2 and f"wheels disagree by {segment.size_m:.1f} m" in judged.sentence
+    assert segment.start_s == pytest.approx(INTERVAL_S * segment.first)
 
 
 def test_a_turn_that_the_matching_did_not_see_is_named():
     truth, _ = course()
     turned = truth.copy()
     turned[600:] = truth[600] @ lie.pose_2d(0.0, 0.0, 0.9) @ lie.inverse(truth[600]) @ truth[600:]
-    (stretch,) = (each for each in judge(evidence(turned, wheels=wheels_of(truth))).stretches if each.size_rad)
-    assert stretch.kind is Kind.WHEELS and 0.8 < stretch.size_rad < 1.0 and "deg" in stretch.text
-    assert stretch.first <= 600 <= stretch.last
+    (segment,) = (each for each in judge(evidence(turned, wheels=wheels_of(truth))).segments if each.size_rad)
+    assert segment.kind is Kind.WHEELS and 0.8 < segment.size_rad < 1.0 and "deg" in segment.text
+    assert segment.first <= 600 <= segment.last
 
 
 def test_of_wheels_and_scans_that_suspect_slipped_which_closures_around_contradict():
@@ -282,7 +282,7 @@ def test_of_wheels_and_scans_that_suspect_slipped_which_closures_around_contradi
     stood = evidence(truth, wheels=wheels_of(slipped))  # the wheels stood still while the robot slid on
     assert judge(stood).verdict is Verdict.CHECK and "wheels disagree" in judge(stood).reason
     judged = judge(replace(stood, closures=closed(truth)))
-    assert judged.verdict is Verdict.TRUSTWORTHY and judged.stretches == ()
+    assert judged.verdict is Verdict.TRUSTWORTHY and judged.segments == ()
     start_s, end_s, size_m = map(float, re.findall(r"wheels slip at (.+) to (.+) s \((.+) m\)", judged.reason)[0])
     assert 54.0 < start_s < 62.0 and 64.0 < end_s < 72.0 and 2.0 < size_m < 3.5
     doubtful = replace(stood, closures=closed(truth), is_degenerate=marked(290, 340))  # may be of look-alikes
@@ -290,8 +290,8 @@ def test_of_wheels_and_scans_that_suspect_slipped_which_closures_around_contradi
     judged = judge(replace(slipped_at(300, 330), closures=closed(truth)))
     assert judged.verdict is Verdict.NOT_TRUSTWORTHY
     assert "scans slip at" in judged.reason and "wheels and loop closures agree with each other" in judged.reason
-    (stretch,) = (each for each in judged.stretches if each.kind is Kind.SCANS_SLIP)
-    assert stretch.first <= 300 and stretch.last >= 325 and 2.0 < stretch.size_m < 3.5
+    (segment,) = (each for each in judged.segments if each.kind is Kind.SCANS_SLIP)
+    assert segment.first <= 300 and segment.last >= 325 and 2.0 < segment.size_m < 3.5
 
 
 @pytest.mark.parametrize("jump_m", [6.0, 1e6])
@@ -300,7 +300,7 @@ def test_wheels_that_jump_are_wrong_without_closures(jump_m):
     assert judged.verdict is Verdict.TRUSTWORTHY and f"s ({jump_m:,.0f}"[:4] in judged.reason
 
 
-def test_states_are_counted_as_the_scans_have_them_in_the_verdict_and_within_a_stretch():
+def test_states_are_counted_as_the_scans_have_them_in_the_verdict_and_within_a_segment():
     fit = np.where(np.arange(N) % 40 == 0, 0.4, 0.9)
     judged = judge(evidence(fit=fit, is_degenerate=marked(5, 8)))
     assert judged.verdict is Verdict.TRUSTWORTHY and "contradiction" not in judged.sentence
@@ -310,15 +310,15 @@ def test_states_are_counted_as_the_scans_have_them_in_the_verdict_and_within_a_s
     ]
     fit = np.where(marked(300, 340), 0.5, 0.9)
     fit[345] = 0.5  # alone
-    (stretch,) = judge(evidence(fit=fit)).stretches
-    assert stretch.scans == int((fit[stretch.first : stretch.last + 1] < 0.6).sum())
+    (segment,) = judge(evidence(fit=fit)).segments
+    assert segment.scans == int((fit[segment.first : segment.last + 1] < 0.6).sum())
 
 
 def test_a_verdict_names_the_error_that_it_vouches_for_where_it_vouches():
     right = replace(evidence(), error="ATE 0.010 to 0.020 m")
     assert judge(right).sentence.startswith("trustworthy (ATE 0.010 to 0.020 m): nothing to check")
     doubted = replace(right, fit=np.where(marked(300, 330), 0.5, 0.9))
-    assert judge(doubted).sentence.startswith("check these stretches (otherwise ATE 0.010 to 0.020 m): ")
+    assert judge(doubted).sentence.startswith("check these segments (otherwise ATE 0.010 to 0.020 m): ")
     wrong = replace(right, is_lost=marked(100, 1000))
     assert judge(wrong).sentence.startswith("not trustworthy: ")
 
@@ -362,8 +362,8 @@ def test_rejected_closures_that_agree_with_each_other_are_a_finding_from_three_o
     closures = [((i, j), lie.between(POSES[i], POSES[j] @ wrong)) for i, j in pairs]
     judged = judge(evidence(closures=closures))
     assert judged.verdict is verdict
-    assert [each.kind for each in judged.stretches] == [Kind.LOOPS] * (count > 2)
-    assert all(each.size_m == pytest.approx(2.0) for each in judged.stretches)
+    assert [each.kind for each in judged.segments] == [Kind.LOOPS] * (count > 2)
+    assert all(each.size_m == pytest.approx(2.0) for each in judged.segments)
 
 
 TIMES_NS = (1e9 * INTERVAL_S * np.arange(301)).astype(np.int64)
@@ -477,19 +477,38 @@ def test_after_a_gap_one_contradicted_scan_is_to_be_checked_unless_wheels_agree_
     poses[316:] = poses[299] @ lie.inverse(poses[315]) @ poses[316:]  # as if the gap had lasted a moment
     changes = {"fit": np.where(marked(316, 316), 0.4, 0.9)[kept], "seconds": INTERVAL_S * np.flatnonzero(kept)}
     for there in (POSES, poses):
-        (stretch,) = judge(evidence(there[kept], **changes)).stretches
-        assert (stretch.kind, stretch.first, stretch.last) == (Kind.CONTRADICTED, 300, 300)
+        (segment,) = judge(evidence(there[kept], **changes)).segments
+        assert (segment.kind, segment.first, segment.last) == (Kind.CONTRADICTED, 300, 300)
     wheels = wheels_of(POSES)[kept]
     assert judge(evidence(POSES[kept], wheels=wheels, **changes)).verdict is Verdict.TRUSTWORTHY
 
 
-def test_a_stretch_shorter_than_a_digit_of_its_times_has_one_time():
-    assert Stretch(Kind.LOST, 7, 8, 2, 2262.91, 2262.94).text == "scans 7 to 8 (2262.9 s): lost"
-    assert Stretch(Kind.LOST, 7, 9, 3, 2262.9, 2263.1).text == "scans 7 to 9 (2262.9 to 2263.1 s): lost"
+def test_a_segment_shorter_than_a_digit_of_its_times_has_one_time():
+    assert Segment(Kind.LOST, 7, 8, 2, 2262.91, 2262.94).text == "scans 7 to 8 (2262.9 s): lost"
+    assert Segment(Kind.LOST, 7, 9, 3, 2262.9, 2263.1).text == "scans 7 to 9 (2262.9 to 2263.1 s): lost"
 
 
-def test_every_kind_of_stretch_has_a_color():
-    assert set(STRETCH_COLORS) == set(Kind) and len(set(STRETCH_COLORS.values())) == len(Kind)
+class Heights(Check):
+    """A check of an altimeter, as one would be added: poses of the lidar by another sensor."""
+
+    name, kind, column, source, limit = "heights", "heights disagree", "height_innovation", "height", 3.0
+
+    def __init__(self, evidence):
+        off_m = evidence.poses[:, 1, -1] - evidence.sources[self.source][:, 1, -1]
+        self.values = np.abs(off_m) / 0.1
+
+
+def test_a_new_check_is_a_class_and_a_line_of_the_table(monkeypatch):
+    monkeypatch.setattr("scanchain.verdict.judging.CHECKS", (*CHECKS, Heights))
+    assert "heights" in judge(evidence(sources={"height": POSES})).reason
+    off = POSES + marked(300, 330)[:, None, None] * np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    judged = judge(evidence(sources={"height": off}))
+    assert judged.verdict is CHECK and judged.reason == "scans 300 to 330 (60.0 to 66.0 s): heights disagree"
+    assert color_of_kind(judged.segments[0].kind) == color_of_kind("another kind of one's own")
+
+
+def test_every_kind_of_segment_has_a_color():
+    assert set(SEGMENT_COLORS) == set(Kind) and len(set(SEGMENT_COLORS.values())) == len(Kind)
 
 
 def test_a_kidnapping_is_wrong_and_flagged_and_the_rest_right(tmp_path, capsys):

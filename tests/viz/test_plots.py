@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scanchain.verdict import Kind
-from scanchain_viz.colors import ODOMETRY, OPTIMIZED, STRETCH_COLORS, TRUTH, palette_of, rgb
+from scanchain_viz.colors import ODOMETRY, OPTIMIZED, SEGMENT_COLORS, TRUTH, palette_of, rgb
 from scanchain_viz.pictures.axis import Axis, width_of
 from scanchain_viz.pictures.figure import Line, Plot
 from scanchain_viz.pictures.maps import draw_map, draw_points
@@ -39,7 +39,7 @@ def share_of(pixels, color, tolerance=0.06):
 
 
 def test_lines_are_drawn_in_their_colors_over_a_map_on_white(drawn):
-    names = (OPTIMIZED, ODOMETRY, TRUTH, STRETCH_COLORS[Kind.WHEELS])
+    names = (OPTIMIZED, ODOMETRY, TRUTH, SEGMENT_COLORS[Kind.WHEELS])
     colors = {color: np.array(rgb(color)) / 255.0 for color in names}
     lines = [Line("", circle(8.0 + k), color) for k, color in enumerate(colors)]
     pixels, alone = drawn(*lines, path=lines[0].positions), drawn(lines[0])
@@ -81,7 +81,7 @@ def test_lines_of_a_run_have_colors_of_their_own_on_white_and_on_black_for_color
         Kind.ACCELERATION,
         Kind.LOOPS,
     )
-    names = [OPTIMIZED, ODOMETRY, TRUTH, *(STRETCH_COLORS[kind] for kind in kinds)]
+    names = [OPTIMIZED, ODOMETRY, TRUTH, *(SEGMENT_COLORS[kind] for kind in kinds)]
     linear = (np.array([rgb(name) for name in names]) / 255.0) ** 2.2
     seen = np.clip(linear @ np.transpose(CONFUSIONS[sight]), 0.0, 1.0)
     lab = np.cbrt(seen @ np.transpose(TO_LMS)) @ np.transpose(TO_LAB)

@@ -20,7 +20,7 @@ from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.closures import final_verdicts
 from scanchain.steps import Steps
-from scanchain.verdict import Judged, Kind, Stretch, Verdict
+from scanchain.verdict import Judged, Kind, Segment, Verdict
 from scanchain_viz.recording import drawing, entities, sinks, viewer
 from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.entities import blueprint
@@ -375,20 +375,20 @@ def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path):
         record(None, drive(10, 2), 2)
 
 
-def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(tmp_path):
+def test_the_verdict_is_recorded_as_text_with_its_segments_as_lines_and_events(tmp_path):
     steps, log = STEPS[2], tmp_path / "a.rrd"
     path = Trajectory(np.array([s.scan.stamp_ns for s in steps]), np.array([s.T_world_lidar for s in steps]))
-    stretches = (Stretch(Kind.LOOPS, 5, 50, 4, 0.5, 5.0, 2.0), Stretch(Kind.WHEELS, 20, 30, 9, 2.0, 3.0, 1.5))
-    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches), stretches, "ATE below 1 m")
+    segments = (Segment(Kind.LOOPS, 5, 50, 4, 0.5, 5.0, 2.0), Segment(Kind.WHEELS, 20, 30, 9, 2.0, 3.0, 1.5))
+    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in segments), segments, "ATE below 1 m")
     with opened(log) as recording:
         for step in steps:
             recording.log(step)
         recording.log_verdict(judged, path)
     assert recording.warnings == []
     texts = [text for row in column(log, entities.EVENTS, "TextLog:text") for text in row]
-    assert [text for text in texts if "stretch" in text] == [f"stretch to check: {s.text}" for s in stretches]
-    (strips,) = column(log, entities.STRETCHES, "LineStrips3D:strips", is_static=True)
+    assert [text for text in texts if "segment" in text] == [f"segment to check: {s.text}" for s in segments]
+    (strips,) = column(log, entities.SEGMENTS, "LineStrips3D:strips", is_static=True)
     assert [len(strip) for strip in strips] == [2, 12]
     document = column(log, entities.VERDICT, "TextDocument:text", is_static=True)[-1]
-    assert document[0].startswith("## check these stretches\n\notherwise ATE below 1 m\n")
-    assert stretches[0].text in document[0]
+    assert document[0].startswith("## check these segments\n\notherwise ATE below 1 m\n")
+    assert segments[0].text in document[0]

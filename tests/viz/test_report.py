@@ -19,7 +19,7 @@ from scanchain.__main__ import main
 from scanchain.comparison.table import COLUMNS, read_table
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
-from scanchain.verdict import Judged, Kind, Stretch, Verdict
+from scanchain.verdict import Judged, Kind, Segment, Verdict
 from scanchain_viz.pictures.figure import Line
 from scanchain_viz.pictures.maps import surroundings
 from scanchain_viz.pictures.trajectories import DrawnTrajectory
@@ -314,7 +314,7 @@ def test_a_verdict_in_a_column_of_text_stands_where_the_text_of_the_others_does(
     assert re.findall(r'<td class="(.*?)"', (tmp_path / "report.html").read_text()) == ["text", "bad text"]
 
 
-def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_findings_counts_in_each():
+def test_segments_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_findings_counts_in_each():
     states = ["contradicted"] * 2 + ["ok"] * 8 + ["degenerate"] * 4 + ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 18
     keyframes = [k // 5 if k % 5 == 0 else -1 for k in range(40)]
     steps = pa.table({"state": states, "keyframe": keyframes})
@@ -325,8 +325,8 @@ def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_
     )  # fmt: skip
     positions = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
     points = np.random.default_rng(1).uniform(-5.0, 45.0, (300, 3))
-    stretch = Stretch(Kind.ACCELERATION, 0, 3, 4, 0.3, 0.4, 0.5)
-    lines = trajectory_lines(positions, steps, closures, [stretch], positions + 0.1)
+    segment = Segment(Kind.ACCELERATION, 0, 3, 4, 0.3, 0.4, 0.5)
+    lines = trajectory_lines(positions, steps, closures, [segment], positions + 0.1)
     section = map_section(lines, points, positions, 0.2)
     assert [chip.name for chip in section.chips] == [
         "trajectory",

@@ -9,7 +9,7 @@ from scanchain.data import BACK_END, VERIFICATION
 from scanchain.verdict import Kind
 
 # Distinguishable from each other on white and on black, also with red-green color blindness.
-STRETCH_COLORS = {
+SEGMENT_COLORS: dict[str, str] = {
     Kind.DEGENERATE: "#dc9a00",
     Kind.LOST: "#b3150c",
     Kind.CONTRADICTED: "#7638b8",
@@ -34,6 +34,11 @@ _COLORS = (
     "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#8c9096",
     "#b0413e", "#5f8f57",
 )  # fmt: skip
+
+
+def color_of_kind(kind: str) -> str:
+    """Color of a kind of finding; gray for one of a check of the user's own."""
+    return SEGMENT_COLORS.get(kind, _COLORS[9])
 
 
 def color_of(place: int) -> str:

@@ -85,9 +85,9 @@ class Batched:
 
     @property
     def doubts(self) -> str:
-        """Number of logs with stretches to check, as text; empty if there are none."""
+        """Number of logs with segments to check, as text; empty if there are none."""
         count = sum(row.metrics is not None and row.metrics.verdict is Verdict.CHECK for row in self.rows)
-        return f"{count:,} of {len(self.rows):,} logs have stretches to check" if count else ""
+        return f"{count:,} of {len(self.rows):,} logs have segments to check" if count else ""
 
 
 def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Batched:
@@ -230,7 +230,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Totals, each log without a result and its reason, each log with stretches to check or warnings."""
+    """Totals, each log without a result and its reason, each log with segments to check or warnings."""
     lines = [f"{name:<14} {text}" for name, text in totals(rows)]
     lines += [f"{row.state:<14} {row.log}: {row.why}" for row in rows if row.state is not State.DONE]
     lines += [

@@ -63,8 +63,8 @@ def evaluate(
     """Print ATE, RPE, KITTI metric and error over relations; several EST as a table.
 
     Give the ground truth, or --relations, or both. GT is a TUM file, interpolated at the stamps of EST (positions
-    linear, rotations by SLERP, nothing extrapolated), or a KITTI file with one row a pose of EST. A run directory
-    stands for its trajectory.tum.
+    linear, rotations by SLERP, nothing extrapolated), or a KITTI file with one row per pose of EST. A run
+    directory stands for its trajectory.tum.
 
     \b
     Examples:

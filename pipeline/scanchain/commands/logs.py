@@ -152,8 +152,8 @@ def convert(
       a ROS 1 bag         .bag
       a ROS 2 bag         .db3, or its folder
       split files         the folder of .mcap, .bag or .db3 files that are parts of one log
-      a KITTI raw drive   ..._sync, calib_imu_to_velo.txt beside it for the ground truth
-      KITTI odometry      sequences/00, poses/00.txt beside sequences for the ground truth
+      a KITTI raw drive   ..._sync, calib_imu_to_velo.txt next to it for the ground truth
+      KITTI odometry      sequences/00, poses/00.txt next to sequences for the ground truth
       an address          https:// or s3://, of any of the files above
       a folder of clouds  PCD, PLY, .npy or .bin of rows x y z (intensity ...), named by their stamps, or with
                           --log.rate_hz
@@ -231,7 +231,7 @@ def convert(
 )
 @options.force("an existing file")
 def simulate(world: str, destination: Path, wheels_slip: tuple[float, float, float] | None, **given: Any) -> None:
-    """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
+    """Write a synthetic log with exact ground truth, and the truth next to it as .tum.
 
     \b
     WORLD is one of

@@ -62,7 +62,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
 @click.option(
     "--marginals",
     metavar="all|IDS",
-    help="Write marginal covariances of these poses, in their own frames, to a .marginals.csv beside --out.",
+    help="Write marginal covariances of these poses, in their own frames, to a .marginals.csv next to --out.",
 )
 @click.option("--png", metavar="FILE", type=PATH, help="Draw the graph before and after optimization.")
 @click.option("--recording", metavar="FILE.rrd", type=PATH, help="Record the graph before and after optimization.")
@@ -99,7 +99,7 @@ def optimize(
     from scanchain.graph.optimization import GraphChange
 
     if marginals is not None and out is None:
-        raise InputError("--marginals writes a table beside the graph; give --out FILE")
+        raise InputError("--marginals writes a table next to the graph; give --out FILE")
     rejected = rejected_path(out) if out else None
     table = out.with_suffix(".marginals.csv") if out and marginals else None
     endings = {out: GRAPH_SUFFIXES, rejected: (), table: (), png: (".png",), recording: (".rrd",)}

@@ -114,9 +114,9 @@ def _sinks(text: str) -> frozenset[SinkName]:
     chosen = frozenset(_SINKS) & set(words)
     unknown = [word for word in words if word not in _SINKS]
     if unknown:
-        raise InputError(f"--rerun is {text!r}; take off, or one or several of {', '.join(_SINKS)} with commas")
+        raise InputError(f"--rerun is {text!r}; give off, or one or several of {', '.join(_SINKS)} with commas")
     if len(chosen - {"save"}) > 1:
-        raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
+        raise InputError(f"--rerun is {text!r}; give only one of spawn, connect, web along with save")
     return chosen
 
 
@@ -164,7 +164,7 @@ def check(
         "verdict": judged.verdict,
         "verdict_reason": judged.reason,
         "verdict_error": judged.error,
-        "stretches": judged.stretches,
+        "segments": judged.segments,
     }
     click.echo(options.json_text(tree) if as_json else text)
     return int(judged.verdict.fails(strict=strict))

@@ -16,14 +16,14 @@ from scanchain.evaluation.errors import far_off, path_length
 from scanchain.runs.results import Results
 from scanchain.slam import SlamResult
 from scanchain.steps import STAGES
-from scanchain.verdict import Judged, Stretch, Verdict
+from scanchain.verdict import Judged, Segment, Verdict
 
 VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and indent of the reasons below it
 _FIRST = 3  # number of reasons that a terminal shows
 _BY_STAGE = ("ms per scan", "  median", "  95th perc.")  # first words of lines that it omits
 _CONDITIONS = {
     Verdict.TRUSTWORTHY: "",
-    Verdict.CHECK: " if no stretch is wrong",
+    Verdict.CHECK: " if no segment is wrong",
     Verdict.NOT_TRUSTWORTHY: " if the trajectory were right",
 }
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
@@ -78,7 +78,7 @@ class Metrics(Struct, frozen=True):
     ``expected_ate_m`` is the ATE estimated without ground truth; null where the graph has no edge or its edges do
     not constrain all poses.
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``verdict_error`` the error
-    estimate, ``stretches`` the suspicious segments to check.
+    estimate, ``segments`` the suspicious segments to check.
     ``elevation_offset_rad`` is the correction of the lidar's vertical angles from the scan ``calibrated_from`` on;
     0 where no error was found; ``elevation_sigma_rad`` its standard deviation, null where none was estimated.
     ``odometry_errors`` : drift, slips and jumps of odometry that loop closures show, corrected in the graph
@@ -120,7 +120,7 @@ class Metrics(Struct, frozen=True):
     warnings: tuple[str, ...]
     verdict: Verdict = Verdict.TRUSTWORTHY
     verdict_reason: str = ""
-    stretches: tuple[Stretch, ...] = ()
+    segments: tuple[Segment, ...] = ()
     expected_ate_m: ExpectedError | None = None
     stopped: str = ""
     compile_s: float = 0.0
@@ -144,7 +144,7 @@ class Metrics(Struct, frozen=True):
     @property
     def judged(self) -> Judged:
         """Verdict, error estimate, reason and segments to check."""
-        return Judged(self.verdict, self.verdict_reason, self.stretches, self.verdict_error)
+        return Judged(self.verdict, self.verdict_reason, self.segments, self.verdict_error)
 
     @property
     def sentence(self) -> str:
@@ -204,7 +204,7 @@ def measure(
         ground_truth=ground_truth,
         verdict=judged.verdict,
         verdict_reason=judged.reason,
-        stretches=judged.stretches,
+        segments=judged.segments,
         verdict_error=judged.error,
         expected_ate_m=expected,
         stopped=stopped,

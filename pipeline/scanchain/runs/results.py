@@ -70,15 +70,15 @@ class Cloud:
 class Results:
     """Everything computed from a log, from which the files of a run directory are written.
 
-    ``drawn`` is the cloud, computed in a background thread while the files that do not need it are written. In 3D
-    the ``grid`` is level: ``T_world_level`` (4, 4) rotates it into the world frame, whose z axis is
-    that of the first lidar pose.
+    ``cloud_ahead`` is the cloud, computed in a background thread while the files that do not need it are written.
+    In 3D the ``grid`` is level: ``T_world_level`` (4, 4) rotates it into the world frame, whose z axis is that of
+    the first lidar pose.
     """
 
     log: Log
     result: SlamResult
     final: tuple[Closure, ...]
-    drawn: Future[Cloud]
+    cloud_ahead: Future[Cloud]
     grid: OccupancyGrid
     T_world_level: Pose
 
@@ -100,7 +100,7 @@ class Results:
     @property
     def cloud(self) -> Cloud:
         """The cloud; waits until it is computed."""
-        return self.drawn.result()
+        return self.cloud_ahead.result()
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -132,14 +132,14 @@ def _write_saved_map(path: Path, results: Results) -> None:
 
 def results_of(log: Log, result: SlamResult, final: tuple[Closure, ...]) -> Results:
     """The results of a log with the maps made from its keyframes."""
-    config, beside = result.config, ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
-    drawn = beside.submit(cloud_of, result.keyframes, result.T_world_keyframes, config)
-    beside.shutdown(wait=False)
+    config, executor = result.config, ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
+    cloud = executor.submit(cloud_of, result.keyframes, result.T_world_keyframes, config)
+    executor.shutdown(wait=False)
     T_world_level = lie.identity(log.dimension)
     if log.dimension == 3:
         T_world_level = level_of(result.keyframes, result.T_world_keyframes, config.local_map)
     grid = grid_of(result.keyframes, lie.inverse(T_world_level) @ result.T_world_keyframes, config.maps)
-    return Results(log, result, final, drawn, grid, T_world_level)
+    return Results(log, result, final, cloud, grid, T_world_level)
 
 
 def expected_of(

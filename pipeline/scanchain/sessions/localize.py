@@ -368,7 +368,7 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) 
         ("log", f"{paths} {log.topic}: {scans} over {m.path_m:.1f} m"),
         ("map", f"{prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}"),
         *lines_of(m),
-        *(("stretch", part.text) for part in m.parts),
+        *(("segment", part.text) for part in m.parts),
         *(("warning", warning) for warning in m.warnings),
         *(("note", note) for note in (*log.notes, mounting_note) if note),
         ("time", f"{m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s"),

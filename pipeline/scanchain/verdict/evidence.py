@@ -38,7 +38,7 @@ class Kind(StrEnum):
     COPIES = "copies of one scan"
 
 
-class Stretch(Struct, frozen=True):
+class Segment(Struct, frozen=True):
     """Consecutive suspicious scans.
 
     kind : one of ``Kind``, or of a check's own
@@ -75,7 +75,7 @@ class Stretch(Struct, frozen=True):
         start, end = f"{self.start_s:.1f}", f"{self.end_s:.1f}"
         return f"{start if start == end else f'{start} to {end}'} s"
 
-    def overlaps(self, other: Stretch) -> bool:
+    def overlaps(self, other: Segment) -> bool:
         """True if both contain a scan."""
         return self.first <= other.last and other.first <= self.last
 
@@ -159,16 +159,19 @@ class Evidence:
         return (self.fit < LEAST_FIT) & ~self.is_lost & ~self.is_degenerate
 
     @property
+    def sensors(self) -> list[Check]:
+        """The checks by other sensors."""
+        return [check for check in self.checks if check.source]
+
+    @property
     def is_confirmed(self) -> NDArray[np.bool_]:
         """(N,) scans around which another sensor agrees with the trajectory."""
-        found = np.zeros(len(self), np.bool_)
-        for check in self.checks:
-            found |= check.is_reference & (check.values <= check.limit)
-        return found
+        return np.any([check.values <= check.limit for check in self.sensors], axis=0)
 
     def is_confirmed_throughout(self, part: slice) -> bool:
         """True if another sensor is known over most of these scans and contradicts none of them."""
-        return any(check.is_reference and check.confirms(part) for check in self.checks)
+        parts = [(check.values[part], check.limit) for check in self.sensors]
+        return any(np.isfinite(part).mean() >= KNOWN and not (part > limit).any() for part, limit in parts)
 
     @property
     def is_after_gap(self) -> NDArray[np.bool_]:
@@ -176,14 +179,14 @@ class Evidence:
         intervals_s = np.diff(self.seconds, prepend=0.0)
         return intervals_s > _LONG_GAP * np.median(intervals_s)
 
-    def stretch(
+    def segment(
         self, kind: str, part: slice, is_marked: NDArray[np.bool_], size_m: float | None = None,
         size_rad: float | None = None,
-    ) -> Stretch:  # fmt: skip
+    ) -> Segment:  # fmt: skip
         """A finding for a part of the scans, some of which are marked (N,)."""
         start_s, end_s = self.seconds[[part.start, part.stop - 1]].tolist()
         count = int(is_marked[part].sum())
-        return Stretch(kind, part.start, part.stop - 1, count, start_s, end_s, size_m, size_rad)
+        return Segment(kind, part.start, part.stop - 1, count, start_s, end_s, size_m, size_rad)
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -198,10 +201,10 @@ class Check:
     name : in the list of checks that were made; empty to leave it out
     kind : of its findings
     column : in steps.parquet; empty for none
-    source : prefix of the columns of steps.parquet with the poses of the lidar by another sensor; empty for none
+    source : prefix of the columns of steps.parquet with the poses of the lidar by another sensor, whose agreement
+        confirms poses that the scans alone do not determine; empty for none
     limit : largest value that is accepted
     harmless : kinds of its findings that are reported, but do not affect the verdict
-    is_reference : whether agreement confirms poses that the scans alone do not determine
     values : (N,) innovation in standard deviations, or what else is checked; NaN where not checked
     extent_m : largest distance from the first pose by the source; NaN where it is not known over most of the log
     bound_m : upper bound of the error of the trajectory by the source; infinite where unknown
@@ -212,9 +215,8 @@ class Check:
     column: ClassVar[str] = ""
     source: ClassVar[str] = ""
     limit: ClassVar[float] = np.inf
-    is_reference: ClassVar[bool] = False
-    values: Floats
     harmless: ClassVar[tuple[str, ...]] = ()
+    values: Floats
     extent_m: float = np.nan
     bound_m: float = np.inf
 
@@ -226,21 +228,16 @@ class Check:
         """True if there was anything to check."""
         return bool(np.isfinite(self.values).any())
 
-    def confirms(self, part: slice) -> bool:
-        """True if the values are known over most of these scans and nowhere above the limit."""
-        values = self.values[part]
-        return bool(np.isfinite(values).mean() >= KNOWN and not (values > self.limit).any())
-
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Suspicious segments; ``found`` are those of the checks before this one."""
         is_marked = self.values > self.limit
-        return (evidence.stretch(self.kind, part, is_marked) for part in merged(is_marked))
+        return (evidence.segment(self.kind, part, is_marked) for part in merged(is_marked))
 
-    def refutations(self, evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
-        """Reasons why the trajectory is not trustworthy; ``stretches`` are those of all checks."""
+    def failures(self, evidence: Evidence, segments: Sequence[Segment]) -> Iterator[str]:
+        """Reasons why the trajectory is not trustworthy; ``segments`` are those of all checks."""
         yield from ()
 
-    def doubts(self, evidence: Evidence) -> Iterator[str]:
+    def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Reasons why the trajectory as a whole is to be checked."""
         yield from ()
 
@@ -256,10 +253,10 @@ def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
     return [slice(int(part[0]), int(part[-1]) + 1) for part in parts if len(part)]
 
 
-def listed(stretches: Sequence[Stretch]) -> str:
+def listed(segments: Sequence[Segment]) -> str:
     """The largest segments in words, and how many more there are."""
-    largest = sorted(stretches, key=lambda each: (each.size_m or 0.0, each.scans), reverse=True)[:_SHOWN]
-    more = len(stretches) - len(largest)
+    largest = sorted(segments, key=lambda each: (each.size_m or 0.0, each.scans), reverse=True)[:_SHOWN]
+    more = len(segments) - len(largest)
     return "; ".join(each.text for each in largest) + (f"; and {more:,} more" if more else "")
 
 

@@ -13,7 +13,7 @@ from scanchain import lie
 from scanchain.data import Pose
 from scanchain.errors import at_most, counted
 from scanchain.verdict.checks import CHECKS
-from scanchain.verdict.evidence import Evidence, Stretch, extent_m, listed
+from scanchain.verdict.evidence import Evidence, Segment, extent_m, listed
 
 _REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # largest extent, rotation and mean speed at rest
 _MOST_OPEN_AT_REST = 0.05  # largest share of unconstrained or contradicted scans from which a rest is concluded
@@ -25,7 +25,7 @@ class Verdict(StrEnum):
     """Reliability of a trajectory as a whole."""
 
     TRUSTWORTHY = "trustworthy"
-    CHECK = "check these stretches"
+    CHECK = "check these segments"
     NOT_TRUSTWORTHY = "not trustworthy"
 
     def fails(self, *, strict: bool) -> bool:
@@ -42,12 +42,12 @@ class Judged:
 
     verdict: Verdict
     reason: str
-    stretches: tuple[Stretch, ...] = ()
+    segments: tuple[Segment, ...] = ()
     error: str = ""
     bound_m: float = np.inf
 
     @property
-    def vouched(self) -> str:
+    def valid_error(self) -> str:
         """The error estimate where it is valid: outside of the segments to check; empty if not trustworthy."""
         words = {Verdict.TRUSTWORTHY: "", Verdict.CHECK: "otherwise "}
         return f"{words[self.verdict]}{self.error}" if self.error and self.verdict in words else ""
@@ -55,13 +55,13 @@ class Judged:
     @property
     def headline(self) -> str:
         """Verdict and error."""
-        return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}"
+        return f"{self.verdict}{f' ({self.valid_error})' if self.valid_error else ''}"
 
     @property
     def reasons(self) -> list[str]:
         """The single reasons, followed by all suspicious segments not among them."""
         said = [each for each in self.reason.split("; ") if not _MORE.fullmatch(each)]
-        return [*said, *(each.text for each in self.stretches if each.text not in said)]
+        return [*said, *(each.text for each in self.segments if each.text not in said)]
 
     @property
     def sentence(self) -> str:
@@ -72,39 +72,39 @@ class Judged:
 def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str = "") -> Judged:
     """The verdict on a trajectory by all ``CHECKS``, with reasons.
 
-    A trajectory is not trustworthy if a check refutes it: most poses are predicted, many scans are contradicted,
+    A trajectory is not trustworthy if it fails a check: most poses are predicted, many scans are contradicted,
     the acceleration is impossible, another sensor contradicts it where it is badly measured, or together with
     loop closures. It is to be checked if any segment is suspicious, or the whole is: motion is indistinguishable
-    from rest, the error is unbounded or large, a check doubts it, or scans are distorted. Segments where only the
-    other sensor is wrong are reported, but do not affect the verdict.
+    from rest, the error is unbounded or large, a check warns of it, or scans are distorted. Segments where only
+    the other sensor is wrong are reported, but do not affect the verdict.
 
     T_base_lidar : mounting stated by the log; None if none is
     distortion : motion distortion of the scans in words; empty for none
     """
     evidence = evidence.checked(CHECKS)
-    checks, found, harmless = evidence.checks, list[Stretch](), set[str]()
+    checks, found, harmless = evidence.checks, list[Segment](), set[str]()
     for check in checks:
-        found += check.stretches(evidence, found)
+        found += check.segments(evidence, found)
         harmless |= {*check.harmless}
     found.sort(key=lambda each: (each.first, each.last))
-    stretches = tuple(each for each in found if each.kind not in harmless)
+    segments = tuple(each for each in found if each.kind not in harmless)
     slips = [f"{each.kind} at {each.times} ({each.size_m:,.1f} m)" for each in found if each.kind in harmless]
     rest = _Rest.of(evidence)
     notes = [*([rest.text] if rest.is_shown else []), *slips]
     notes += [note for check in checks for note in check.notes(T_base_lidar)]
     reasons = ["one scan has no motion that could be checked"] if len(evidence) == 1 else []
-    reasons += [each for check in checks for each in check.refutations(evidence, stretches)]
+    reasons += [each for check in checks for each in check.failures(evidence, segments)]
     verdict = Verdict.NOT_TRUSTWORTHY
     if not reasons:
-        reasons = [*_whole(evidence, rest), *(each for check in checks for each in check.doubts(evidence))]
-        reasons += [listed(stretches)] * bool(stretches) + [distortion] * bool(distortion)
+        reasons = [*_whole(evidence, rest), *(each for check in checks for each in check.warnings(evidence))]
+        reasons += [listed(segments)] * bool(segments) + [distortion] * bool(distortion)
         verdict = Verdict.CHECK
     if not reasons:
         verdict, reasons = Verdict.TRUSTWORTHY, list(_nothing(evidence))
     error = evidence.error or (
         f"error below {max(rest.extent_m, evidence.open_m):.2g} m" if rest.is_shown else "error unknown"
     )
-    return Judged(verdict, "; ".join([*reasons, *notes]), stretches, error, evidence.bound_m)
+    return Judged(verdict, "; ".join([*reasons, *notes]), segments, error, evidence.bound_m)
 
 
 def _whole(evidence: Evidence, rest: _Rest) -> Iterator[str]:

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.consistency import FEWEST, carried, connected
-from scanchain.verdict.evidence import Check, Closures, Evidence, Floats, Kind, Stretch, merged
+from scanchain.verdict.evidence import Check, Closures, Evidence, Floats, Kind, Segment, merged
 
 _LEAST_M = 0.5  # least translation error of a closure that is a contradiction
 _NEAR_M = 10.0  # largest path between two closures of a group, summed over both ends
@@ -34,11 +34,11 @@ class Loops(Check):
         """True if verification accepted a closure."""
         return len(self.closures.target) > 0
 
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Segments between the ends of groups of closures that contradict the poses."""
         yield from contradicting_groups(self.closures, evidence.poses, evidence.seconds)
 
-    def doubts(self, evidence: Evidence) -> Iterator[str]:
+    def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Few accepted closures."""
         tried, accepted = self.closures.tried, int(self.closures.is_accepted.sum())
         if tried >= _FEWEST_TRIED and accepted < _LEAST_ACCEPTED * tried:
@@ -53,7 +53,7 @@ class Connections(Check):
 
     kind = Kind.DISCONNECTED
 
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Segments whose pose relative to the first one is unknown."""
         segment = np.cumsum(evidence.starts_segment)
         closures = evidence.closures
@@ -63,10 +63,10 @@ class Connections(Check):
             label[label == label[high]] = label[low]
         for number in np.flatnonzero(label != label[0]).tolist():
             (part,) = merged(segment == number)
-            yield evidence.stretch(self.kind, part, segment == number)
+            yield evidence.segment(self.kind, part, segment == number)
 
 
-def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> list[Stretch]:
+def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> list[Segment]:
     """Segments between the ends of groups of at least three closures that agree, but contradict the final poses.
 
     Either the motion over the segment is wrong by about the same distance, or the two places are perceptually
@@ -99,5 +99,5 @@ def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> 
             first, last = int(low.min()), int(high.max())
         start_s, end_s = seconds[[first, last]].tolist()
         wrong_m = float(np.median(size_m[chosen][members]))
-        groups.append(Stretch(Kind.LOOPS, first, last, len(members), start_s, end_s, wrong_m))
+        groups.append(Segment(Kind.LOOPS, first, last, len(members), start_s, end_s, wrong_m))
     return groups

@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 
 from scanchain import lie
 from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
-from scanchain.verdict.evidence import Check, Evidence, Floats, Kind, Stretch, listed, merged
+from scanchain.verdict.evidence import Check, Evidence, Floats, Kind, Segment, listed, merged
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
 _MOST_PREDICTED = 0.5  # largest share of scans with a predicted pose that nothing confirms
@@ -42,7 +42,7 @@ class States(Check):
     def __init__(self, evidence: Evidence) -> None:
         self.values = evidence.fit
 
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Segments of lost, degenerate and contradicted scans."""
         median = median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest")
         fits_badly = (evidence.is_after_gap & ~evidence.is_confirmed) | (median < LEAST_FIT)
@@ -50,12 +50,12 @@ class States(Check):
         yield from _of_state(evidence, Kind.DEGENERATE, evidence.is_degenerate)
         yield from _of_state(evidence, Kind.CONTRADICTED, evidence.is_contradicted & fits_badly)
 
-    def refutations(self, evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+    def failures(self, evidence: Evidence, segments: Sequence[Segment]) -> Iterator[str]:
         """Many contradicted scans, or mostly predicted poses."""
         yield from _many_contradicted(evidence)
         yield from _mostly_predicted(evidence)
 
-    def doubts(self, evidence: Evidence) -> Iterator[str]:
+    def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Many degenerate scans."""
         count = int(evidence.is_degenerate.sum())
         if count > _MOST_OPEN * len(evidence):
@@ -93,7 +93,7 @@ def _mostly_predicted(evidence: Evidence) -> Iterator[str]:
         yield f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
 
 
-def _of_state(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> Iterator[Stretch]:
+def _of_state(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> Iterator[Segment]:
     """Segments of marked scans that are too long for the prediction of the motion to be harmless.
 
     An unmarked scan in between measures the pose again, which ends the prediction. Not so between contradicted
@@ -105,7 +105,7 @@ def _of_state(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> I
         limits_m = [_PASSED_CONFIRMED_M if evidence.is_confirmed_throughout(run) else _PASSED_M for run in runs]
         if any(_extent_m(evidence, run, kind) > limit_m for run, limit_m in zip(runs, limits_m, strict=True)):
             counted = evidence.is_contradicted if kind is Kind.CONTRADICTED else is_marked
-            yield evidence.stretch(kind, part, counted)
+            yield evidence.segment(kind, part, counted)
 
 
 def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
@@ -127,10 +127,10 @@ class Overlap(Check):
     def __init__(self, evidence: Evidence) -> None:
         self.values = check_overlap(evidence.inlier_share)
 
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Segments where many correspondences are lost at once, except where a segment begins."""
         has_left = (self.values < _LEAST_OVERLAP) & ~evidence.starts_segment
-        return (evidence.stretch(self.kind, part, has_left) for part in merged(has_left))
+        return (evidence.segment(self.kind, part, has_left) for part in merged(has_left))
 
 
 def check_overlap(inlier_share: Floats) -> Floats:
@@ -155,7 +155,7 @@ class Velocity(Check):
     def __init__(self, evidence: Evidence) -> None:
         self.values = check_velocity(evidence.stamps_ns, evidence.log_times_ns, evidence.poses)
 
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Segments of impossible accelerations, except where a segment begins."""
         is_new = evidence.starts_segment
         is_marked = (self.values > self.limit) & ~is_new & ~np.concatenate([[False], is_new[:-1]])
@@ -163,11 +163,11 @@ class Velocity(Check):
         jumps_m[2:] = np.linalg.norm(np.diff(evidence.poses[:, :-1, -1], n=2, axis=0), axis=1)
         for part in merged(is_marked):
             size_m = float(jumps_m[part][is_marked[part]].max())
-            yield evidence.stretch(self.kind, part, is_marked, size_m)
+            yield evidence.segment(self.kind, part, is_marked, size_m)
 
-    def refutations(self, evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+    def failures(self, evidence: Evidence, segments: Sequence[Segment]) -> Iterator[str]:
         """The large jumps."""
-        jumps = [each for each in stretches if each.kind == self.kind and (each.size_m or 0.0) > _LARGE_M]
+        jumps = [each for each in segments if each.kind == self.kind and (each.size_m or 0.0) > _LARGE_M]
         if jumps:
             yield listed(jumps)
 
@@ -224,7 +224,7 @@ class Copies(Check):
 
     kind = Kind.COPIES
 
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Segments of more than a few copies that no other sensor confirms."""
         positions = evidence.poses[:, :-1, -1]
         for part in merged(evidence.is_copy, 0):
@@ -232,4 +232,4 @@ class Copies(Check):
                 continue
             is_at_end = part.start == 1 or part.stop == len(evidence)
             if is_at_end or np.linalg.norm(positions[part.stop] - positions[part.stop - 1]) > _RESTING_M:
-                yield evidence.stretch(self.kind, part, evidence.is_copy)
+                yield evidence.segment(self.kind, part, evidence.is_copy)

@@ -15,7 +15,7 @@ from scanchain.errors import counted
 from scanchain.registration import hand_eye
 from scanchain.registration.hand_eye import HandEye
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
-from scanchain.verdict.evidence import KNOWN, Check, Closures, Evidence, Floats, Kind, Stretch, extent_m, merged
+from scanchain.verdict.evidence import KNOWN, Check, Closures, Evidence, Floats, Kind, Segment, extent_m, merged
 
 WINDOW_M = 4.0  # path over which wheels and trajectory are compared
 _SHORTEST_M = 0.5  # shortest path of a window that is checked
@@ -55,7 +55,7 @@ class Wheels(Check):
     """
 
     name, kind, column, source = "wheels", Kind.WHEELS, "wheel_innovation", "wheel"
-    limit, is_reference, harmless = 8.0, True, (Kind.WHEELS_SLIP,)
+    limit, harmless = 8.0, (Kind.WHEELS_SLIP,)
 
     def __init__(self, evidence: Evidence) -> None:
         super().__init__(evidence)
@@ -116,7 +116,7 @@ class Wheels(Check):
             innovation = np.maximum(innovation, apart[checked] / sigma)
         self.values[checked] = innovation
 
-    def stretches(self, evidence: Evidence, found: Sequence[Stretch]) -> Iterator[Stretch]:
+    def segments(self, evidence: Evidence, found: Sequence[Segment]) -> Iterator[Segment]:
         """Segments where wheels and trajectory disagree, each with the source that slipped.
 
         At badly measured scans, closures may join ambiguous places, so that they do not prove that the wheels
@@ -127,24 +127,24 @@ class Wheels(Check):
         slipped = which_slipped(parts, odometry, self.poses, evidence.closures)
         for part, (kind, whole_m) in zip(parts, slipped, strict=True):
             size_m, size_rad = (float(np.nanmax(each[part])) for each in (self.apart_m, self.apart_rad))
-            stretch = evidence.stretch(kind, part, is_marked, max(size_m, whole_m), size_rad)
-            if kind == Kind.WHEELS or (kind == Kind.WHEELS_SLIP and any(map(stretch.overlaps, found))):
-                stretch = evidence.stretch(self.kind, part, is_marked, size_m, size_rad)
-            yield stretch
+            segment = evidence.segment(kind, part, is_marked, max(size_m, whole_m), size_rad)
+            if kind == Kind.WHEELS or (kind == Kind.WHEELS_SLIP and any(map(segment.overlaps, found))):
+                segment = evidence.segment(self.kind, part, is_marked, size_m, size_rad)
+            yield segment
 
-    def refutations(self, evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+    def failures(self, evidence: Evidence, segments: Sequence[Segment]) -> Iterator[str]:
         """Scans that slipped by the wheels and by loop closures, or where they are badly measured."""
-        for slip in (each for each in stretches if each.kind == Kind.SCANS_SLIP):
+        for slip in (each for each in segments if each.kind == Kind.SCANS_SLIP):
             yield (
                 f"{slip.kind} at {slip.times} ({slip.size_m:,.1f} m): "
                 "wheels and loop closures agree with each other"
             )
-        slips = [each for each in stretches if each.kind == Kind.WHEELS]
+        slips = [each for each in segments if each.kind == Kind.WHEELS]
         for slip in slips:
-            cause = next((each for each in stretches if each.kind in _UNMEASURED and each.overlaps(slip)), None)
+            cause = next((each for each in segments if each.kind in _UNMEASURED and each.overlaps(slip)), None)
             if cause is not None:
                 yield f"{slip.text}, at scans that are not well measured: {cause.kind}"
-        loops = [each for each in stretches if each.kind == Kind.LOOPS]
+        loops = [each for each in segments if each.kind == Kind.LOOPS]
         for loop, slip in product(loops, slips):
             is_confirmed = (slip.size_m or 0.0) > _CONFIRMED * (loop.size_m or 0.0)
             if is_confirmed and slip.overlaps(loop):
@@ -154,7 +154,7 @@ class Wheels(Check):
                 )
                 return
 
-    def doubts(self, evidence: Evidence) -> Iterator[str]:
+    def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Wheels that turn opposite, or that disagree throughout by more than the largest σ learned for them."""
         if self.turn_ratio < _OPPOSED:
             yield (

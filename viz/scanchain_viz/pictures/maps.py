@@ -19,8 +19,8 @@ from scanchain.evaluation import on_the_estimate, path_length
 from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
-from scanchain.verdict import Kind, Stretch
-from scanchain_viz.colors import ODOMETRY, OPTIMIZED, STRETCH_COLORS, TRUTH, color_of, height_shares, palette_of
+from scanchain.verdict import Kind, Segment
+from scanchain_viz.colors import ODOMETRY, OPTIMIZED, TRUTH, color_of, color_of_kind, height_shares, palette_of
 from scanchain_viz.pictures.figure import DASHED, INK, Floats, Line, Plot, around, write_png
 
 Grid = tuple[NDArray[np.int8], float, tuple[float, float]]  # as ``read_map`` returns it
@@ -202,7 +202,7 @@ def draw_run(directory: Path, picture: Path) -> None:
     except (OSError, ValueError):
         metrics = {}
     path, grid = None, None
-    if "stretches" in metrics:
+    if "segments" in metrics:
         lines, path = _lines_of_run(directory, metrics)
     elif "placed" in metrics:
         if not metrics["placed"]:
@@ -230,7 +230,7 @@ def draw_run(directory: Path, picture: Path) -> None:
 
 
 def _lines_of_run(directory: Path, metrics: dict[str, Any]) -> tuple[list[Line], Floats]:
-    """Trajectories, truth and stretches to check of a run, and its path (N, 3)."""
+    """Trajectories, truth and segments to check of a run, and its path (N, 3)."""
     optimized, truth_file = read_tum(directory / "trajectory.tum"), directory / TRUTH_FILE
     odometry, path = read_tum(directory / "odometry.tum").poses, optimized.poses[:, :3, 3]
     lines = [_line("odometry", odometry, ODOMETRY, 1.0), _line("optimized", optimized.poses, OPTIMIZED, 1.8)]
@@ -238,10 +238,10 @@ def _lines_of_run(directory: Path, metrics: dict[str, Any]) -> tuple[list[Line],
         accuracy = metrics["ground_truth"] or {}
         truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=accuracy.get("max_gap_s"))
         lines.append(_line("ground truth", truth.poses, TRUTH))
-    for each in msgspec.convert(metrics["stretches"], tuple[Stretch, ...]):
+    for each in msgspec.convert(metrics["segments"], tuple[Segment, ...]):
         if each.kind is not Kind.LOOPS:
             part = path[max(each.first - 1, 0) : each.last + 1]
-            lines.append(Line(str(each.kind), part, STRETCH_COLORS[each.kind], 3.0))
+            lines.append(Line(str(each.kind), part, color_of_kind(each.kind), 3.0))
     return lines, path
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanchain.data import State
 from scanchain.steps import STAGES
 from scanchain.verdict import Kind
-from scanchain_viz.colors import STRETCH_COLORS, between, height_shares, rgb
+from scanchain_viz.colors import SEGMENT_COLORS, between, height_shares, rgb
 from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels
 
 WORLD = "world"
@@ -35,7 +35,7 @@ KEYFRAMES = "world/graph/keyframes"
 ODOMETRY_EDGES = "world/graph/odometry"
 ACCEPTED = "world/graph/loops/accepted"
 REJECTED = "world/graph/loops/rejected"
-STRETCHES = "world/stretches"
+SEGMENTS = "world/segments"
 MAP = "world/map"
 GRID = "world/grid"
 TIME = "plots/time"
@@ -80,7 +80,7 @@ _LEGEND = f"""
 - **violet dots, gray edges**: keyframes and the odometry between them
 - **green edges**: accepted loop closures; pale where the back end lowered their weight below ½
 - **red edges**: loop closures that the matcher or, later, the back end rejected
-- **thick lines**: stretches to check, listed in the verdict and in the events
+- **thick lines**: segments to check, listed in the verdict and in the events
 - **violet ellipsoid**: the matcher's standard deviation of the position, enlarged {COVARIANCE_SCALE:.0f} times
 
 **Observability** is the information along the least constrained direction over the minimum required: below 1
@@ -103,7 +103,7 @@ def constants(dimension: int) -> list[Message]:
     """Static messages: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
     stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
-    marked = [rgb(STRETCH_COLORS[kind]) for kind in (Kind.CONTRADICTED, Kind.DEGENERATE, Kind.LOST)]
+    marked = [rgb(SEGMENT_COLORS[kind]) for kind in (Kind.CONTRADICTED, Kind.DEGENERATE, Kind.LOST)]
     states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, *marked])
     return [
         UP,

@@ -24,14 +24,14 @@ from scanchain.errors import InputError
 from scanchain.runs.job import SinkName
 from scanchain.steps import Steps
 from scanchain.verdict import Judged, Kind
-from scanchain_viz.colors import STRETCH_COLORS, rgb
+from scanchain_viz.colors import color_of_kind, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import Sink, file_sink, is_readable, open_stream, send_layout, viewer_sink
 
-_LISTED = 50  # largest number of stretches in the text of a verdict
-_RADIUS = 3.5  # of a stretch's line, in UI points
+_LISTED = 50  # largest number of segments in the text of a verdict
+_RADIUS = 3.5  # of a segment's line, in UI points
 
 
 @dataclass(eq=False)
@@ -129,7 +129,7 @@ class Recording:
         self._send(lambda: self.batcher.settled(closures, graph))
 
     def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
-        """Record the verdict, and its stretches on the optimized trajectory of all scans of the log."""
+        """Record the verdict, and its segments on the optimized trajectory of all scans of the log."""
         self._send(lambda: _verdict(judged, trajectory))
 
     def log_ground_truth(self, poses: Matrix) -> None:
@@ -222,27 +222,27 @@ def _grid(cells: NDArray[np.int8], resolution_m: float, origin_m: tuple[float, f
 
 
 def _verdict(judged: Judged, trajectory: Trajectory) -> Iterator[Message]:
-    """The verdict as text, its stretches as lines and as events."""
-    listed = "".join(f"- {each.text}\n" for each in judged.stretches[:_LISTED])
-    more = len(judged.stretches) - _LISTED
+    """The verdict as text, its segments as lines and as events."""
+    listed = "".join(f"- {each.text}\n" for each in judged.segments[:_LISTED])
+    more = len(judged.segments) - _LISTED
     listed += f"- and {more:,} more\n" if more > 0 else ""
-    text = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n{listed}"
+    text = f"## {judged.verdict}\n\n{judged.valid_error}\n\n{judged.reason}\n\n{listed}"
     yield Message(entities.VERDICT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
-    if not judged.stretches:
+    if not judged.segments:
         return
     path = drawing.positions(trajectory.poses)
     strips = [  # for disagreeing loops, the line between their ends
         path[[each.first, each.last]] if each.kind is Kind.LOOPS else path[max(each.first - 1, 0) : each.last + 1]
-        for each in judged.stretches
+        for each in judged.segments
     ]
     lines = rr.LineStrips3D(
         strips,
-        colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
+        colors=[rgb(color_of_kind(each.kind)) for each in judged.segments],
         radii=drawing.pixels(_RADIUS),
-        labels=[str(each.kind) for each in judged.stretches],
+        labels=[str(each.kind) for each in judged.segments],
         show_labels=False,
     )
-    yield Message(entities.STRETCHES, lines)
-    first = np.array([each.first for each in judged.stretches], np.int64)
-    texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
+    yield Message(entities.SEGMENTS, lines)
+    first = np.array([each.first for each in judged.segments], np.int64)
+    texts = [[(WARNING, f"segment to check: {each.text}")] for each in judged.segments]
     yield from events(texts, Times(first, trajectory.stamps_ns[first]))

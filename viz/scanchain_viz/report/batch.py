@@ -26,7 +26,7 @@ _BEYOND = 1.05  # factor on the size of a plan, so that marks at its edge are no
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a count is marked
 _HEADS = (
     page.Head("log"),
-    page.Head("verdict", "", "reliability of the trajectory; stretches to check are in the run's report"),
+    page.Head("verdict", "", "reliability of the trajectory; segments to check are in the run's report"),
     page.Head("scans"),
     page.Head("contr.", "", "contradicted scans: their correspondences contradict the pose"),
     page.Head("degen.", "", "degenerate scans: a direction of motion is unobservable"),

@@ -119,7 +119,7 @@ def _localized(localized: LocalizedLog) -> Iterator[page.Section]:
     yield _path_section(localized)
     yield page.Section("State over the path", drawings=[_states_picture(localized)])
     heads = (page.Head("kind"), page.Head("scans"), page.Head("time", "s"), page.Head("path", "m"))
-    for title, is_doubtful in (("Stretches to check", True), ("Stretches without the map", False)):
+    for title, is_doubtful in (("Segments to check", True), ("Segments without the map", False)):
         rows = []
         for part in localized.metrics.parts:
             if part.is_doubtful is is_doubtful:

@@ -21,8 +21,8 @@ from scanchain.runs.provenance import Provenance
 from scanchain.settings import read_layer
 from scanchain.steps import STAGES
 from scanchain.trajectory import read_tum
-from scanchain.verdict import CHECKS, Kind, Stretch
-from scanchain_viz.colors import CLOSURES, OPTIMIZED, STRETCH_COLORS, TRUTH, color_of
+from scanchain.verdict import CHECKS, Kind, Segment
+from scanchain_viz.colors import CLOSURES, OPTIMIZED, SEGMENT_COLORS, TRUTH, color_of
 from scanchain_viz.pictures.figure import Floats, Line, Plot, broken
 from scanchain_viz.pictures.maps import over_map, surroundings
 from scanchain_viz.pictures.trajectories import column_of, frame, trajectories_of_run
@@ -39,7 +39,7 @@ _ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the h
     (page.Head("KITTI rot.", "deg/m"), "kitti_rotation_rad_per_m", np.degrees(1.0), 4),
 )
 _SHADE = "#8c9096"
-_MAX_ROWS = 100  # largest number of stretches in the table; the longest are kept
+_MAX_ROWS = 100  # largest number of segments in the table; the longest are kept
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _DISPUTED = "at closures rejected by the back end"
 _STATES = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)  # kinds that are also states of scans
@@ -86,7 +86,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     optimized, closures = trajectories[0], sections.read_closures(directory / "loops.parquet")
     if accuracy is not None:
         yield accuracy_section(accuracy)
-    lines = trajectory_lines(optimized.positions, steps, closures, metrics.stretches, true_path)
+    lines = trajectory_lines(optimized.positions, steps, closures, metrics.segments, true_path)
     box, grain_m = frame([optimized], true_path), float(str(config["maps.voxel_size_m"]))
     yield map_section(lines, read_ply(directory / "map.ply"), box, grain_m)
     yield verdict_section(metrics, steps)
@@ -114,7 +114,7 @@ def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: flo
 
 
 def trajectory_lines(
-    path: Floats, steps: pa.Table, closures: pa.Table | None, stretches: Sequence[Stretch], truth: Floats | None
+    path: Floats, steps: pa.Table, closures: pa.Table | None, segments: Sequence[Segment], truth: Floats | None
 ) -> list[Line]:
     """The trajectory, closures by verdict, scans to check (one may be in several lines), and the ground truth."""
     lines = [Line("trajectory", path, OPTIMIZED, 1.2)]
@@ -125,7 +125,7 @@ def trajectory_lines(
     marks += [(str(kind), states == kind, kind) for kind in _STATES]
     for kind in _OVER_STATES:
         is_marked = np.zeros(len(steps), bool)
-        for each in stretches:
+        for each in segments:
             is_marked[each.first : each.last + 1] |= each.kind == kind
         marks.append((str(kind), is_marked, kind))
     for name, is_marked, kind in marks:  # later ones are drawn on top
@@ -133,7 +133,7 @@ def trajectory_lines(
             name = f"{name}: {counted(int(is_marked.sum()), 'scan')}"
             leads_there = is_marked | np.append(is_marked[1:], False)
             part = np.where(leads_there[:, None], path, np.nan)
-            lines.append(Line(name, part, STRETCH_COLORS[kind], 2.6))
+            lines.append(Line(name, part, SEGMENT_COLORS[kind], 2.6))
     if truth is not None:
         lines.append(Line("ground truth", truth, TRUTH, 0.9, is_dashed=True))
     return lines
@@ -161,9 +161,9 @@ def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
 
 
 def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
-    """Innovations along the log, relative to their limits, and the stretches to check."""
+    """Innovations along the log, relative to their limits, and the segments to check."""
     figure, chips = Plot("scan", "innovation / limit", is_wide=True), []
-    shaded = [each for each in metrics.stretches if each.kind != Kind.LOOPS]
+    shaded = [each for each in metrics.segments if each.kind != Kind.LOOPS]
     for each in shaded:
         figure.span(each.first - 0.5, each.last + 0.5, f"{_SHADE}33")
     for place, check in enumerate(_CURVES):
@@ -172,17 +172,17 @@ def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
             figure.line(sections.windowed(np.clip(values, *sections.CLIPPED), np.max), color_of(place), 0.9)
             chips.append(page.Chip(check.name, color_of(place)))
     figure.level(1.0)
-    chips += [page.Chip("stretches to check", _SHADE)] if shaded else []
+    chips += [page.Chip("segments to check", _SHADE)] if shaded else []
     size = sections.window(len(steps))
     largest = f", largest of {size} neighboring scans" if size > 1 else ""
     text = f"Normalized innovations over their limits{largest}; above 1 (dotted): a finding, or wheel slip."
-    grid = _stretches(metrics.stretches) if metrics.stretches else None
+    grid = _segments(metrics.segments) if metrics.segments else None
     return page.Section("Checks", "", chips, [page.Drawing.of("Innovations", text, figure)], grid)
 
 
-def _stretches(stretches: Sequence[Stretch]) -> page.Grid:
-    """The longest stretches, in the order of the log."""
-    longest = sorted(stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
+def _segments(segments: Sequence[Segment]) -> page.Grid:
+    """The longest segments, in the order of the log."""
+    longest = sorted(segments, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
     rows = []
     for each in sorted(longest, key=lambda each: each.first):
         scans = [f"{number:,}" for number in (each.first, each.last, each.scans)]
@@ -192,7 +192,7 @@ def _stretches(stretches: Sequence[Stretch]) -> page.Grid:
         *map(page.Head, ("finding", "first", "last", "scans")),
         page.Head("start", "s"), page.Head("end", "s"), page.Head("size", "m"),
     )  # fmt: skip
-    left = len(stretches) - len(rows)
+    left = len(segments) - len(rows)
     return page.Grid(heads, rows, [f"and {left:,} shorter ones in metrics.json"] if left else ())
 
 
