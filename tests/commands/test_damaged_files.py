@@ -18,7 +18,7 @@ from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.logs.formats.clouds import CloudFileError, read_npy
 from scanchain.maps import open_saved_map
 from scanchain.maps.files import write_ply
-from scanchain.runs.judging import evidence_of_run
+from scanchain.runs.judging import judge_run
 from scanchain.sessions.elsewhere import import_map
 from tests.support import made
 from tests.support.naive_logs import office, write
@@ -88,7 +88,7 @@ def test_a_run_whose_tables_are_damaged_is_refused_by_their_name(finished, call,
         for damaged in (b"", b"PAR1", data[: len(data) // 2], *mutants(data, 4, len(data), 12)):
             path.write_bytes(damaged)
             with suppress(InputError):
-                evidence_of_run(finished, None)
+                judge_run(finished)
         path.write_bytes(data[:-9])
         code, _, errors = call("check", finished)
         assert code == 2 and f"has no {name} that can be read" in errors and "--debug" not in errors

@@ -18,7 +18,7 @@ from scanchain.landmarks.files import read_landmark_data
 from scanchain.logs.formats.clouds import CloudFileError, read_cloud_file
 from scanchain.maps import Edges, SavedMap, SavedPoints, Session, open_saved_map, write_laz, write_saved_map
 from scanchain.maps.files import read_las
-from scanchain.runs.judging import evidence_of_run
+from scanchain.runs.judging import judge_run
 from tests.support import made
 from tests.support.fuzzing import within_bounds
 from tests.support.mutations import any_mutant
@@ -58,7 +58,7 @@ def run_kinds(folder):
     """As ``kinds``, of a run directory."""
     run = made.run("office", folder, log__end_s=4.0)
     for name in ("steps.parquet", "loops.parquet"):
-        yield name, run / name, _as_it_is, partial(evidence_of_run, run, None)
+        yield name, run / name, _as_it_is, partial(judge_run, run)
 
 
 def complaints(made_kinds, rng, count):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -25,7 +26,10 @@ from scanchain.runs.directory import METRICS_FILE
 from scanchain.runs.evidence import evidence_of, evidence_of_trajectory
 from scanchain.settings import Override, load_settings
 from scanchain.trajectory import read_tum
-from scanchain.verdict import Evidence, Judged, apart_m, judge
+from scanchain.verdict import Judged, apart_m, judge
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _FEWEST = 3  # minimum number of scans with a pose
 
@@ -38,13 +42,25 @@ class Known(msgspec.Struct):
 
 
 def judge_run(folder: Path) -> Judged:
-    """The verdict on the tables of a run directory. Raises InputError where it has none."""
+    """The verdict on the tables of a run directory. Raises InputError where it has none that can be read."""
+    import pyarrow.parquet as pq
+
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
+    tables, known = list["pa.Table"](), known_of_run(folder)
+    for path in (folder / "steps.parquet", folder / "loops.parquet"):
+        if tables and not path.exists():
+            continue
+        try:
+            tables.append(pq.ParquetFile(path, page_checksum_verification=True).read())
+        except Exception as error:  # any that Arrow raises on a damaged or foreign file
+            remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
+            why = "" if isinstance(error, FileNotFoundError) else f" ({one_line(error)})"
+            raise InputError(f"{folder}: has no {path.name} that can be read{why}; {remedy}") from error
     try:
-        known = known_of_run(folder)
-        return judge(evidence_of_run(folder, known.expected_ate_m), distortion=known.distortion)
-    except InputError:
-        raise
-    except Exception as error:  # any that NumPy raises on damaged figures
+        evidence = evidence_of(tables[0], *tables[1:], expected=known.expected_ate_m)
+        return judge(evidence, distortion=known.distortion)
+    except Exception as error:  # any that Arrow or NumPy raises on damaged figures
         raise InputError(f"{folder}: its tables are damaged ({one_line(error)}); run the log again") from error
 
 
@@ -54,25 +70,6 @@ def known_of_run(folder: Path) -> Known:
         return msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=Known)
     except (OSError, msgspec.DecodeError):
         return Known()
-
-
-def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
-    """Evidence of every scan in a run directory. Raises InputError where it has no tables."""
-    import pyarrow.parquet as pq
-
-    if not folder.is_dir():
-        raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
-    name = "steps.parquet"
-    try:
-        steps, closures = pq.ParquetFile(folder / name, page_checksum_verification=True).read(), None
-        name = "loops.parquet"
-        if (folder / name).exists():
-            closures = pq.ParquetFile(folder / name, page_checksum_verification=True).read()
-        return evidence_of(steps, closures, expected)
-    except Exception as error:  # any that Arrow or NumPy raises on a damaged or foreign file
-        remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
-        why = "" if isinstance(error, FileNotFoundError) else f" ({one_line(error)})"
-        raise InputError(f"{folder}: has no {name} that can be read{why}; {remedy}") from error
 
 
 def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Override]) -> tuple[Judged, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError, counted
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
+from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
 from scanchain.odometry.distortion import choose_point_times
@@ -29,16 +30,19 @@ from scanchain.trajectory import write_tum
 class Opened:
     """The log of a job with its settings.
 
+    sources : the files of the log
     configuration : the settings in words
-    truth : ground truth if a file is named; else the log's own is used, if it has one
+    truth_file : ground truth if a file is named; else the log's own is used, if it has one
+    max_gap_s : longest gap between true poses to interpolate over; None for the default
     """
 
-    job: Job
+    sources: Sequence[Source]
     progress: Progress
     log: Log
     config: Config
     configuration: str
-    truth: TruthFile | None
+    truth_file: TruthFile | None
+    max_gap_s: float | None
 
     def stopped_after(self, count: int) -> str:
         """Why the log ended after so many scans; empty if it was not stopped."""
@@ -46,22 +50,22 @@ class Opened:
 
     def scans_again(self) -> Generator[Scan, None, None]:
         """The scans of the log, opened once more."""
-        return open_log(self.job.logs, self.log.config).scans(self.config.preprocess)
+        return open_log(self.sources, self.log.config).scans(self.config.preprocess)
 
     def true_poses(self, stamps_ns: NDArray[np.int64]) -> Trajectory | None:
         """True poses, of a KITTI file those of the scans (N,) before a stop. Raises InputError."""
-        if self.truth is None:
+        if self.truth_file is None:
             return self.log.ground_truth()
-        return (self.truth.first(len(stamps_ns)) if self.progress.stopped else self.truth).at(stamps_ns)
+        return (self.truth_file.first(len(stamps_ns)) if self.progress.stopped else self.truth_file).at(stamps_ns)
 
     def accuracy(self, result: SlamResult, folder: Path) -> tuple[GroundTruth | None, tuple[str, ...]]:
         """Accuracy if there is ground truth, which is written to the folder; warnings if it may mislead."""
-        source = str(self.job.ground_truth or self.log.ground_truth_topic)
+        source = self.log.ground_truth_topic if self.truth_file is None else str(self.truth_file.path)
         try:
             reference = self.true_poses(result.odometry.stamps_ns)
             if reference is None:
                 return None, ()
-            truth, misleading = compare_with_truth(result, reference, source, self.job.max_gap_s)
+            truth, misleading = compare_with_truth(result, reference, source, self.max_gap_s)
             write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
         except InputError as error:
             return None, (f"no accuracy against {source}: {error.text}",)
@@ -106,4 +110,4 @@ def opened(job: Job, progress: Progress) -> Opened:
         if not log.ground_truth_topic:
             raise InputError(f"{log.name}: has no topic {topic}; scanchain info lists those with poses")
         check_overlap(topic, log.expected_stamps(topic), log.expected_stamps(log.topic))
-    return Opened(job, progress, log, settings.config, settings.source, truth)
+    return Opened(job.logs, progress, log, settings.config, settings.source, truth, job.max_gap_s)

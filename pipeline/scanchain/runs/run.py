@@ -61,30 +61,26 @@ def run(
     """
     compiled_before_s = compiled_s()
     directory = RunDirectory(job.out, force=job.force, sources=job.logs, command=job.command, resume=job.resume)
-    log = opened(job, progress)
-    left = None if directory.left is None else read_checkpoint(directory.left, log.config)
+    source = opened(job, progress)
+    left = None if directory.left is None else read_checkpoint(directory.left, source.config)
     checkpoints = Checkpoints(directory.path, job.checkpoint_s, left)
-    this = _Run(log, directory, checkpoints, progress)
-    this.announce(is_resumed=job.resume)
+    this = _Run(source, directory, checkpoints, progress)
+    this.announce(job)
     with directory, announcing_compilation(progress.say):
         try:
-            directory.begin(log.configuration, log.config)
-            compile_ahead([f"{log.log.dimension}d"], progress.compiling)
-            slam, scans = checkpoints.start(log)
-            path, name = directory.path / RECORDING_FILE, directory.destination.name
-            options = {
-                "dimension": slam.dimension,
-                "name": name,
-                "sinks": job.sinks,
-                "config": log.config.recording,
-            }
-            with record(path, **options) as recording:
+            directory.begin(source.configuration, source.config)
+            compile_ahead([f"{source.log.dimension}d"], progress.compiling)
+            slam, scans = checkpoints.start(source)
+            with record(
+                directory.path / RECORDING_FILE, dimension=slam.dimension, name=directory.destination.name,
+                sinks=job.sinks, config=source.config.recording,
+            ) as recording:  # fmt: skip
                 result = this.process(slam, scans, recording)
                 results, expected, judged = this.write(result, recording)
                 slam.points.close()
                 held_s = this.hold(recording, is_saved=bool(job.sinks))
             run_s = working_s() - directory.began_s + (left.run_s if left else 0.0) - held_s
-            times_s = {"run_s": run_s, "compile_s": compiled_s() - compiled_before_s}
+            times_s = run_s, compiled_s() - compiled_before_s
             metrics, text = this.measure(results, expected, judged, recording.warnings, times_s)
             return this.complete(metrics, text, report)
         except (Exception, KeyboardInterrupt) as error:
@@ -106,14 +102,9 @@ class _Run:
         self.steps = Steps() if left is None else left.slam.steps
         self.notes, self.resumed = list[str](), ""
 
-    def announce(self, *, is_resumed: bool) -> None:
+    def announce(self, job: Job) -> None:
         """Show what is processed, and whether from the first scan on."""
-        log, out, left, announce = (
-            self.log,
-            self.directory.destination,
-            self.directory.left,
-            self.progress.announce,
-        )
+        log, left, announce = self.log, self.directory.left, self.progress.announce
         if self.checkpoints.absent:
             announce(self.checkpoints.absent)
         count = counted(log.scan_count, "scan")
@@ -122,13 +113,13 @@ class _Run:
             announce(f"warning: {gap}")
         if left is not None:
             announce(f"resuming after {counted(len(self.steps), 'scan')} of {left.name}")
-        elif idle := stopped_run(out):
+        elif idle := stopped_run(job.out):
             announce(
                 f"{idle.name} is of a run that did not end; --resume would continue it, this run starts over and "
                 "removes it once complete"
             )
-        elif is_resumed:
-            announce(f"{out}: no checkpoint to resume from, this run starts at the first scan")
+        elif job.resume:
+            announce(f"{job.out}: no checkpoint to resume from, this run starts at the first scan")
 
     def process(self, slam: Slam, scans: Generator[Scan, None, None], recording: Recorder) -> SlamResult:
         """SLAM result of all scans, processed from the first one or from the checkpoint on."""
@@ -164,7 +155,7 @@ class _Run:
             with suppress(InputError):  # reported with the accuracy
                 reference = self.source.true_poses(result.trajectory.stamps_ns)
                 if reference is not None:
-                    moved = on_the_estimate(result.trajectory, reference, gap_s=self.source.job.max_gap_s)
+                    moved = on_the_estimate(result.trajectory, reference, gap_s=self.source.max_gap_s)
                     recording.log_ground_truth(moved.poses)
         return results, expected, judged
 
@@ -193,10 +184,11 @@ class _Run:
 
     def measure(
         self, results: Results, expected: ExpectedErrors | None, judged: Judged, of_recording: Sequence[str],
-        times_s: dict[str, float],
+        times_s: tuple[float, float],
     ) -> tuple[Metrics, str]:  # fmt: skip
         """Metrics and summary of the run, which are also written to the directory."""
-        log, result, stopped = self.log, results.result, self.source.stopped_after(len(self.steps))
+        log, result, (run_s, compile_s) = self.log, results.result, times_s
+        stopped = self.source.stopped_after(len(self.steps))
         lost = [*log.damage, *self.notes, *result.warnings, *results.warnings, *of_recording]
         if len(self.steps) <= _FEW_SCANS:
             few = f"a trajectory of {counted(len(self.steps), 'scan')}"
@@ -206,8 +198,8 @@ class _Run:
         with self.directory.results() as folder:
             truth, note = self.source.accuracy(result, folder)
             metrics = measure(
-                results, expected and expected.ate, judged, **times_s, ground_truth=truth,
-                warnings=(*lost, *note), stopped=stopped,
+                results, expected and expected.ate, judged, run_s=run_s, compile_s=compile_s,
+                ground_truth=truth, warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
             notes = [note for note in (self.resumed, *log.notes, result.mounting_note, *idle) if note]
             text = summary(metrics, self.source.heading(stopped), self.source.configuration, notes)
