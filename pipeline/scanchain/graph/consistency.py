@@ -1,4 +1,4 @@
-"""Consistency of loop edges with all other edges, for single edges and for groups of edges that agree."""
+"""Consistency of single edges, and of groups of loop edges that agree, with all other edges."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ _ROUNDING = 1e-9  # avoids a division by zero for edges that alone connect their
 
 
 class Consistency:
-    """Squared Mahalanobis distance between what edges measure and what all the other kept edges predict.
+    """Squared Mahalanobis distance between the measurement of edges and their prediction by all other kept edges.
 
-    To first order it is the decrease of the χ² of the whole graph when kept edges are removed, and its increase
-    when rejected edges are added. With P the covariance of the prediction, given all kept edges, it is
-        eᵀ(Ω⁻¹ − P)⁻¹e of kept edges,    eᵀ(Ω⁻¹ + P)⁻¹e of others.
-    The χ² of a kept edge by itself is too small, since the edge pulls the graph toward its own measurement.
+    To first order it is the change of the χ² of the graph: the decrease when a kept edge is removed, the increase
+    when a rejected edge is added. With the residual e at the minimum over the kept edges, the edge's information Ω
+    and the covariance P of its prediction by all kept edges, it is
+        eᵀ(Ω⁻¹ − P)⁻¹e of a kept edge,    eᵀ(Ω⁻¹ + P)⁻¹e of a rejected one.
+    The own χ² of a kept edge, eᵀΩe, is less, since the edge pulls the poses toward its measurement.
     """
 
     def __init__(self, problem: GraphProblem, poses: Matrix, kept: Mask) -> None:
@@ -34,10 +35,10 @@ class Consistency:
         self._sparse = problem.factored(poses, self._errors, kept)
 
     def of_each(self, price: float) -> Vector:
-        """Distance of every edge, (E,), from all others.
+        """Distance of every edge, (E,).
 
-        If a lower bound of the distance of a rejected edge, by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is already above
-        the price, the bound is returned.
+        Of rejected edges it is a lower bound, by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), where that is already above the
+        price: only the others need a solve each.
         """
         problem, kept, every = self._problem, self._kept, np.arange(len(self._kept))
         blocks = inverse_blocks(self._sparse)
@@ -52,7 +53,7 @@ class Consistency:
         return result
 
     def of_group(self, group: Integers) -> float:
-        """Distance of a group of edges, all of them kept or none, from all others."""
+        """Distance of a group of edges, all of them kept or all rejected, to their prediction by the others."""
         k, count = self._problem.freedom, len(group)
         J = self._jacobians[group]
         joint = difference_covariances(self._sparse, self._problem.edges[group])  # at [b, a]
@@ -64,7 +65,7 @@ class Consistency:
         return float(_distances(self._errors[group].reshape(1, size), omega, P, self._kept[group[:1]])[0])
 
     def _distances(self, edges: Integers, joint: Matrix) -> Vector:
-        """Distances of single edges, (N,), from the covariances (N, k, k) of ξ_j − ξ_i."""
+        """Distances of single edges, (N,), by the covariances (N, k, k) of ξ_j − ξ_i from the kept edges."""
         J = self._jacobians[edges]
         predicted = J @ joint @ np.swapaxes(J, 1, 2)
         return _distances(self._errors[edges], self._problem.information[edges], predicted, self._kept[edges])

@@ -53,7 +53,7 @@ class Explained:
 
 @dataclass(frozen=True, slots=True)
 class Explainer:
-    """Optimizes a graph and accepts odometry errors (explanations) that lower its cost by more than their own.
+    """Optimizes a graph; accepts odometry errors (explanations) that save more cost than their own penalty.
 
     problem_of : the problem under an explanation
     measured, information : (E, ...) of all edges, as added
@@ -151,12 +151,12 @@ class Explainer:
 
 
 class RejectedLoops:
-    """The L loop edges that a minimum rejects, and their first-order response to changes of odometry.
+    """Loop edges that a minimum rejects, and the first-order change of their residuals by errors of odometry.
 
-    None is near another, since edges near each other may share a mistake.
+    Of edges near each other, which may share a mistake, only the first counts.
 
     problem, factored : all edges, and those kept with H factored at the poses
-    edges : (L,) these loop edges, each of which represents ``stride`` such edges
+    edges : (L,) these loop edges; where they are too many, every ``stride``-th of them, weighted accordingly
     odometry : (O,) the edges of odometry in the order of the poses
     errors, jacobians : (E, k), (E, k, k) residuals e and ∂e/∂ξ_j of all edges
     covariances : (L, k, k) of their residuals, from their own noise and from the graph without them
@@ -185,7 +185,7 @@ class RejectedLoops:
             moved = responses(self.factored, *problem.edges[edge])
             self.joint[place] = moved[end] - moved[begin]
 
-    def weighed(self, sigma: Matrix | float = 0.0) -> tuple[Matrix, Matrix]:
+    def weighted(self, sigma: Matrix | float = 0.0) -> tuple[Matrix, Matrix]:
         """Residuals (L, k) of these loop edges, and their information (L, k, k), multiplied by ``stride``.
 
         sigma : additional standard deviations (L, k)
@@ -245,7 +245,7 @@ def drift_step(loops: RejectedLoops, sign: Vector, drift: Vector, price: float) 
         moved = V @ change
         lengths = [np.linalg.norm(part, axis=1) for part in (moved[:, :d], moved[:, d:])]
         sigma = _CURVATURE * np.repeat(np.stack(lengths, axis=1), (d, moved.shape[1] - d), axis=1)
-        found = _largest_fall(A, b, *loops.weighed(sigma), V, price)
+        found = _largest_fall(A, b, *loops.weighted(sigma), V, price)
         fall, change = max((fall, change), found, key=lambda each: each[0])
     return fall, change
 
@@ -262,15 +262,22 @@ def next_segment(
     """First-order decrease of the cost by the best additional slip or jump, and this; None if none lowers it.
 
     measured : (O, d+1, d+1) measurements of odometry, in the order of ``loops.odometry``
-    Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included. A rejected loop edge then
-    costs min(price, (e + V t)ᵀC⁻¹(e + V t)) instead of its price. Each of these edges gives a candidate t.
+    Odometry errors t of a segment, in standard deviations, change the cost of the kept edges and the prior of t by
+    tᵀA t − 2 bᵀt. A rejected loop edge then costs min(price, (e + V t)ᵀC⁻¹(e + V t)) instead of its price. The
+    candidates for t are the least-squares solutions for each of these edges.
 
-    A requires a linear solve, so that segments are tried in the order of a bound. In the bound, each loop edge has
-    errors t of its own, at its share of that change, and A is estimated: along a chain with accurate ends, the
-    information on a slip of all edges is that of the edges themselves, and on a slip of one edge the share given
-    by its redundancy; these shares add up to one.
+    Segments of every length that overlap no others are tried, in steps of half their length. Since A takes a
+    linear solve, the order is that of an upper bound of the decrease, and ends where that is below the best one
+    found. In the bound, each loop edge has errors t of its own at 1/L of the change above, and A is estimated: if
+    the ends of a chain are accurate, the information on a slip of all edges is that of the edges themselves, and
+    that on a slip of one edge its share by redundancy; these shares add up to one.
     """
-    tried = _segments(len(measured), others, is_jump=is_jump)
+    tried = [
+        InflatedSegment(first, length, is_jump)
+        for length in ((1,) if is_jump else _SLIP_LENGTHS)
+        for first in range(0, len(measured) - length + 1, max(length // 2, 1))
+        if all(first >= other.edges.stop or other.first >= first + length for other in others)
+    ]
     if not tried:
         return 0.0, None
     first, count = np.array([(segment.first, segment.count) for segment in tried]).T
@@ -284,18 +291,18 @@ def next_segment(
     A = unit + (learned if is_jump else np.minimum(learned, claimed))
     b = _means(pull_t @ loops.errors[loops.odometry][..., None], first, count)[..., 0]
     costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
-    e, M, price = *loops.weighed(), loops.stride * price
+    e, M, price = *loops.weighted(), loops.stride * price
     alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without explaining any of them
-    hoped = -costs
+    bound = -costs
     for error, weight, shift in zip(e, M, loops.shifts(B), strict=True):
         V = _means(shift, first, count)
         g = b / len(e) - np.swapaxes(V, 1, 2) @ (weight @ error)
         H = A / len(e) + np.swapaxes(V, 1, 2) @ weight @ V
         fall = (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1) + price - error @ weight @ error
-        hoped += np.maximum(fall, alone)
+        bound += np.maximum(fall, alone)
     most, best = 0.0, None
-    for index in np.argsort(-hoped, kind="stable")[:_MOST_SEGMENTS]:
-        if not hoped[index] > most:
+    for index in np.argsort(-bound, kind="stable")[:_MOST_SEGMENTS]:
+        if not bound[index] > most:
             break
         segment, twists = tried[index], B[tried[index].edges] / count[index]
         slope, curvature = loops.quadratic(twists, segment.edges)
@@ -330,13 +337,3 @@ def _means(each: Matrix, first: Integers, count: Integers) -> Matrix:
     """Mean (S, ...) over the edges of each segment, of values (O, ...)."""
     sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
     return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
-
-
-def _segments(edges: int, others: tuple[InflatedSegment, ...], *, is_jump: bool) -> list[InflatedSegment]:
-    """Segments of every length among this many edges, each shifted by half its length, that overlap no others."""
-    return [
-        InflatedSegment(first, length, is_jump)
-        for length in ((1,) if is_jump else _SLIP_LENGTHS)
-        for first in range(0, edges - length + 1, max(length // 2, 1))
-        if all(first >= other.edges.stop or other.first >= first + length for other in others)
-    ]

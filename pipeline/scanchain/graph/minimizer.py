@@ -70,7 +70,7 @@ class Minimizer:
         chi2 = self.problem.chi2(errors)
         return Evaluation(poses, errors, chi2, self._cost(chi2, loss))
 
-    def reweighed(self, now: Evaluation, loss: Loss) -> Evaluation:
+    def reweighted(self, now: Evaluation, loss: Loss) -> Evaluation:
         """The same poses with the cost under another loss."""
         return Evaluation(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
 

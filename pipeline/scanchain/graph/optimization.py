@@ -165,7 +165,7 @@ def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[
             break
         minimum = focus.descend(now, loss, Limits(1, 0.0))
         now, used = minimum.estimate, used + minimum.iterations
-    return minimizer.reweighed(now, loss), loss, used
+    return minimizer.reweighted(now, loss), loss, used
 
 
 def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: RobustLoss) -> Minimum:
@@ -223,7 +223,7 @@ def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: 
         return minimum
     against = _against(minimizer, minimum, nominal)
     price = fair_price(against[kept], nominal, problem.residuals[minimizer.robust][kept])
-    minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
+    minimum = replace(minimum, estimate=minimizer.reweighted(minimum.estimate, InlierSet(kept, price)))
     minimum = _refine_edges(minimizer, minimum, against, price)
     if groups:
         minimum = _refine_groups(minimizer, minimum, price, nominal)
