@@ -28,8 +28,9 @@ class GrowingArray:
         """Append rows (n, ...)."""
         end = self._count + len(rows)
         if end > len(self._room):
-            more = np.empty((max(len(self._room), len(rows)), *self._room.shape[1:]), self._room.dtype)
-            self._room = np.concatenate([self._room, more])
+            room = np.empty((max(2 * len(self._room), end), *self._room.shape[1:]), self._room.dtype)
+            room[: self._count] = self._room[: self._count]
+            self._room = room
         self._room[self._count : end] = rows
         self._count = end
 
