@@ -146,7 +146,7 @@ def test_boxes_in_the_plan_carry_the_numbers_of_the_table_which_has_no_empty_col
     found = scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2))
     page = (tmp_path / "ab" / "report.html").read_text()
     for number in ("1", "2"):
-        assert page.count(f'text-anchor: start">{number}</text>') == 4  # wide, narrow, and in two close-ups
+        assert page.count(f'text-anchor="start">{number}</text>') == 4  # wide, narrow, and in two close-ups
     assert "counterpart" not in page
     moved = replace(found, clusters=(replace(found.clusters[0], counterpart=2), found.clusters[1]))
     grid = _cluster_grid(moved)

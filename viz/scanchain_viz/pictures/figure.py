@@ -43,7 +43,8 @@ _FAR = 1e5  # points beyond which nothing is drawn
 _LEVEL = 3  # PNG compression: a higher level takes twice as long and saves a tenth
 _FRAME = "#cccccc"  # of axes on white
 _PANEL_INCHES = (2.0, 12.0)  # least and greatest height of a figure in a PNG
-_TITLE_INCHES, _TITLE_FONT = 0.77, 11.0  # room for its title and labels, and the height of their text in points
+_TITLE_INCHES = 0.77  # room for its title and labels
+_TITLE_FONT, _LABEL_FONT = 11.0, 9.0  # heights of their text in points
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +82,7 @@ class Plot:
         self.has_grid = True
         self.height_inches, self.is_wide, self.proportions = height_inches, is_wide, (0.0, 0.0)  # of a plan
         self._within: list[Callable[[], str]] = []
-        self._on_axes: list[Callable[[Axes], object]] = []
+        self.on_axes: list[Callable[[Axes], object]] = []
 
     @classmethod
     def of_plan(cls, low: Floats, high: Floats, *, is_wide: bool = False, has_grid: bool = False) -> Plot:
@@ -117,7 +118,7 @@ class Plot:
         style = _stroke(color, width, dashes)
         self._within.append(lambda: f'<path d="{_path(self._at(x, y))}" style="{style}"/>')
         drawn = {"color": _on_white(color), "linewidth": width, "label": name or None}
-        self._on_axes.append(lambda axes: axes.plot(x, y, linestyle=(0, (*dashes,)) if dashes else "-", **drawn))
+        self.on_axes.append(lambda axes: axes.plot(x, y, linestyle=(0, (*dashes,)) if dashes else "-", **drawn))
 
     def marks(
         self, positions: Positions, shape: str, color: str, size: float, *, line: float = 0.0, name: str = ""
@@ -143,7 +144,7 @@ class Plot:
         self._within.append(path)
         drawn = {"markersize": size, "color": _on_white(color), "label": name or None}
         drawn |= {"markerfacecolor": "none", "markeredgewidth": line} if line else {}
-        self._on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
+        self.on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
 
     def text(self, position: Floats, text: str) -> None:
         """Write text above and to the right of a position (2,)."""
@@ -178,7 +179,7 @@ class Plot:
 
         self._within.append(drawn)
         extent = (low[0], high[0], low[1], high[1])
-        self._on_axes.append(
+        self.on_axes.append(
             lambda axes: axes.imshow(palette[pixels], origin="lower", extent=extent, interpolation="antialiased")
         )
 
@@ -208,17 +209,6 @@ class Plot:
         """The figure as SVG for a page, a wide one also in a narrow version; it never contains text from a log."""
         sizes = (("wide", True), ("narrow", False)) if self.is_wide else (("", False),)
         return Markup("".join(self._drawn(name, is_wide=is_wide) for name, is_wide in sizes))
-
-    def draw_on(self, axes: Axes, title: str) -> None:
-        """Draw on axes of matplotlib, with a white background."""
-        for draw in self._on_axes:
-            draw(axes)
-        axes.set(xlim=self.x.ends, ylim=self.y.ends, aspect="equal" if self.proportions[0] else "auto")
-        axes.set_xlabel(self.x.label, fontsize=_TITLE_FONT - 2.0)
-        axes.set_ylabel(self.y.label, fontsize=_TITLE_FONT - 2.0)
-        axes.set_title(title, loc="left", fontsize=_TITLE_FONT)
-        axes.tick_params(labelsize=_TITLE_FONT - 2.0, color=_FRAME)
-        axes.spines[:].set_color(_FRAME)
 
     def _drawn(self, name: str, *, is_wide: bool) -> str:
         self._lay_out(is_wide=is_wide)
@@ -303,10 +293,19 @@ def write_png(path: Path, panels: Sequence[tuple[str, Plot]], *, width_inches: f
     size = len(panels) * width_inches, float(height_inches) + _TITLE_INCHES
     figure, named = Figure(figsize=size, layout="constrained"), {}
     for axes, (title, plot) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        plot.draw_on(axes, title)
+        for draw in plot.on_axes:
+            draw(axes)
+        axes.set(xlim=plot.x.ends, ylim=plot.y.ends, aspect="equal" if plot.proportions[0] else "auto")
+        axes.set_title(title, loc="left", fontsize=_TITLE_FONT)
+        axes.set_xlabel(plot.x.label, fontsize=_LABEL_FONT)
+        axes.set_ylabel(plot.y.label, fontsize=_LABEL_FONT)
+        axes.tick_params(labelsize=_LABEL_FONT, color=_FRAME)
+        axes.spines[:].set_color(_FRAME)
         named |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if named:
-        figure.legend([*named.values()], [*named], loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+        figure.legend(
+            [*named.values()], [*named], loc="outside lower center", ncols=5, frameon=False, fontsize=_LABEL_FONT
+        )
     picture = BytesIO()
     figure.savefig(picture, facecolor="white", format="png", dpi=150, bbox_inches="tight")
     write_whole(path, picture.getvalue())
