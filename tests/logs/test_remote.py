@@ -14,7 +14,7 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError, MissingExtraError
 from scanchain.files import Address, source_of
 from scanchain.logs import files, open_log, writer
-from scanchain.logs.mcap.index import Walk, empty_index
+from scanchain.logs.formats.mcap import Walk, empty_index
 from scanchain.logs.opening import index_files
 from scanchain.logs.stream import complete
 from scanchain.runs.provenance import Provenance, identity_of

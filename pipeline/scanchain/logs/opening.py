@@ -26,7 +26,6 @@ from scanchain.logs.formats import (
 )
 from scanchain.logs.formats.user import index_scans
 from scanchain.logs.index import FileIndex
-from scanchain.logs.mcap.index import index_by_summary
 from scanchain.logs.stream import are_parts, complete
 
 _FORMATS = mcap.FORMAT, ros1_bag.FORMAT, ros2_bag.FORMAT, carmen.FORMAT, kitti.RAW, kitti.ODOMETRY, clouds.FORMAT
@@ -99,7 +98,7 @@ def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
         return _index_path(source, number, config)
     file = RemoteFile(source)
     if file.has_ranges and config.format in (AUTO, "mcap"):
-        index = index_by_summary(file, number)
+        index = mcap.index_by_summary(file, number)
         if index is not None:
             return index
     copy = fetch_whole(file)

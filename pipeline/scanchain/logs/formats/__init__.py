@@ -1,4 +1,4 @@
-"""What a log format declares, and its two ways: messages made on reading, or conversion to a temporary MCAP."""
+"""What a log format declares, and helpers for formats whose messages are made on reading."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal
 
 from scanchain.config import LogConfig
-from scanchain.errors import InputError
 from scanchain.logs.index import Block, Channel, FileIndex
-from scanchain.logs.mcap.index import index_file
-from scanchain.logs.writer import LogWriter, schema_text
+from scanchain.logs.writer import schema_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,20 +51,6 @@ def add_block(
     held = {channel.key[1]: count for channel, count in counts.items() if count}
     span = min(times_ns), max(times_ns)
     index.blocks.append(Block(index.number, offset, size, "", size, *span, held))
-
-
-def temporary_index(path: Path, number: int, write: Callable[[LogWriter], None]) -> FileIndex:
-    """Index of the messages that ``write`` converts from a path, as the ``number``-th file of a log."""
-    with TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True) as folder:
-        copy = Path(folder) / "log.mcap"
-        try:
-            with LogWriter(copy) as log:
-                write(log)
-        except OSError as error:
-            raise InputError(f"{copy}: {path} cannot be converted there ({error.strerror}); set TMPDIR") from error
-        index = index_file(copy, number)  # memory-maps the file, so it may be deleted
-    index.path = path
-    return index
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:

@@ -21,7 +21,8 @@ import numpy as np
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, printable
-from scanchain.logs.formats import Format, UnknownFormatError, temporary_index
+from scanchain.logs.formats import Format, UnknownFormatError
+from scanchain.logs.formats.mcap import temporary_index
 from scanchain.logs.index import FileIndex, most_decompressed_file
 from scanchain.logs.writer import (
     LATEST_NS,

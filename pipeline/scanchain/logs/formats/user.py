@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scanchain import plugins
 from scanchain.data import Scan
 from scanchain.errors import InputError, counted, shown
-from scanchain.logs.formats import temporary_index
+from scanchain.logs.formats.mcap import temporary_index
 from scanchain.logs.index import FileIndex
 from scanchain.logs.writer import LATEST_NS, LogWriter
 
