@@ -100,7 +100,10 @@ def test_run_info_and_convert_take_the_flag(own, tmp_path, capsys):
         ("yield 1e18, [[1, 2, 3]], None", r"stamp_s is 1e\+18; wanted seconds"),
         ("yield 1.0, [1, 2, 3], None", r"scan 0 .*: points has the shape \(3,\)"),
         ("yield 1.0, [[1, 2, 3]], [1, 2]", r"times_s has the shape \(2,\); wanted \(1,\)"),
-        ("yield 1.0, [[1, 2, 3]], None; yield 1.1, [[1, 2]], None", r"scan 1 .* points are not \(N, 3\) as before"),
+        (
+            "yield 1.0, [[1, 2, 3]], None; yield 1.1, [[1, 2]], None",
+            r"scan 1 .* points are not \(N, 3\)",
+        ),
         (
             "yield 1.0, [[1, 2, 3]], None; 1 / 0",
             r"scan 1 .*ZeroDivisionError: division by zero \(File .*own_\d+\.py\", line",
