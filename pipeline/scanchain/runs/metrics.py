@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from msgspec import Struct
@@ -158,12 +159,9 @@ def measure(
     judged: Judged,
     *,
     run_s: float,
-    compile_s: float,
-    ground_truth: GroundTruth | None,
-    warnings: Sequence[str] = (),
-    stopped: str = "",
+    **of_run: Any,
 ) -> Metrics:
-    """Metrics of a finished run."""
+    """Metrics of a finished run; ``of_run`` are those that are neither of its scans nor of its results."""
     result, cloud, final, steps = results.result, results.cloud, results.final, results.result.steps
     columns, states = steps.columns, steps.states()
     residuals_m = columns["residual_m"][np.isfinite(columns["residual_m"])]
@@ -201,15 +199,11 @@ def measure(
         median_inlier_share=float(np.median(steps.inlier_shares)),
         median_residual_m=float(np.median(residuals_m)) if len(residuals_m) else None,
         median_iterations=float(np.median(columns["iterations"])),
-        ground_truth=ground_truth,
         verdict=judged.verdict,
         verdict_reason=judged.reason,
         segments=judged.segments,
         verdict_error=judged.error,
         expected_ate_m=expected,
-        stopped=stopped,
-        warnings=tuple(warnings),
-        compile_s=compile_s,
         elevation_offset_rad=result.elevation_offset_rad,
         elevation_sigma_rad=result.elevation_sigma_rad if math.isfinite(result.elevation_sigma_rad) else None,
         calibrated_from=result.calibrated_from,
@@ -217,6 +211,7 @@ def measure(
         range_noise_m=result.noise.sigma_m or None,
         range_noise=result.noise.text,
         distortion=results.log.distortion,
+        **of_run,
     )
 
 

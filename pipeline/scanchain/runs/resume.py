@@ -289,7 +289,7 @@ def rescued(error: BaseException, directory: RunDirectory, steps: Steps) -> Base
     is_or_are = "is" if len(steps) == 1 and not is_bug else "are"
     where = f"{'traceback.txt and the ' if is_bug else ''}{until} {is_or_are} in {directory.path}"
     try:
-        directory.end(duration_s=0.0, stopped=reason, is_complete=False)
+        directory.end(stopped=reason, is_complete=False)
         _keep(error if is_bug else None, directory.path, steps)
     except OSError as failure:
         why = "" if isinstance(error, OSError) else f" ({remedy_of(failure) or failure.strerror})"
