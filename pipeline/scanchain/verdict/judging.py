@@ -141,7 +141,7 @@ class _Rest:
         seconds = float(evidence.seconds[-1])
         whole_m, limit_m = extent_m(evidence.poses), min(_REST_M, _REST_M_S * seconds)
         by_sources_m = [check.extent_m for check in evidence.checks if np.isfinite(check.extent_m)]
-        is_there = bool(max(whole_m, *by_sources_m, 0.0) < limit_m and motion[:, d:].max() < _REST_RAD)
+        is_there = bool(max([whole_m, *by_sources_m]) < limit_m and motion[:, d:].max() < _REST_RAD)
         is_open = evidence.is_degenerate | evidence.is_lost | evidence.is_contradicted
         is_observed = bool(np.isfinite(evidence.fit).any() and is_open.mean() <= _MOST_OPEN_AT_REST)
         is_shown = is_there and (is_observed or bool(by_sources_m))
