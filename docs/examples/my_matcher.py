@@ -15,8 +15,8 @@ class PointToPoint:
     def align(self, points, target, T_first, prior=None, *, wide=False):
         limit_m = self.config.wide_max_distance_m if wide else self.config.max_distance_m
         means, T, d = target.points(), T_first, points.shape[1]
-        tree, paired, distance_m, iteration = KDTree(means), np.zeros(0, bool), np.zeros(0), 0
-        for iteration in range(self.config.max_iterations):
+        tree, paired, distance_m = KDTree(means), np.zeros(0, bool), np.zeros(0)
+        for _ in range(self.config.max_iterations):
             moved = points @ T[:d, :d].T + T[:d, d]
             distance_m, nearest = map(np.asarray, tree.query(moved, distance_upper_bound=limit_m))
             paired = np.isfinite(distance_m)
@@ -34,13 +34,8 @@ class PointToPoint:
             cost=float(np.square(np.minimum(distance_m, limit_m)).sum()),
             inliers=inliers,
             points=len(points),
-            iterations=iteration + 1,
             residual_m=float(np.sqrt(np.mean(distance_m[paired] ** 2))),
-            fit=1.0,
             at_minimum=is_good,
             converged=is_good,
             reason="converged" if is_good else "few correspondences",
-            degeneracy_eigenvalue=1.0,
-            observability=1.0,
-            degeneracy_direction=np.eye(k)[0],
         )

@@ -56,12 +56,12 @@ class BackEnd:
         self.config, self.is_live = config, is_live
         self.keyframes: list[Keyframe] = []
         self.errors: list[KeyframeErrors] = []
-        self.first, self.start_m = 0, 0.0
+        self.first, self.start_m = 0 if prior is None else len(prior.keyframes), 0.0
         self.graph = PoseGraph(dimension)
         self.nothing = np.zeros((self.graph.freedom,) * 2)  # information of no measurement, covariance of no error
         self.closer = LoopCloser(config, dimension, is_live=is_live)
         schedule = Schedule(self.graph, config.graph, config.maps.voxel_size_m)
-        self.placement = Placement(config.loops, self.closer, schedule, self.keyframes)
+        self.placement = Placement(config.loops, self.closer, schedule, self.keyframes, self.first)
         if prior is not None:
             self._begin_in(prior, prior_is_final)
 
@@ -77,7 +77,6 @@ class BackEnd:
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
         self.keyframes += prior.keyframes
         self.errors += [KeyframeErrors(1.0, self.nothing, 1.0)] * len(prior.keyframes)
-        self.first = self.placement.first = len(prior.keyframes)
         self.start_m = self.closer.begin_in(prior.keyframes, prior.folder, is_final=is_final)
 
     def add(

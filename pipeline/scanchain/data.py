@@ -188,7 +188,7 @@ class Match:
         translation and rotation compare; 0 is unobservable, 1 is a direction that every residual constrains
     observability : of the worst direction, ratio of its information to the least that ``matching.min_information``
         and ``matching.min_signal`` require; below 1 the scan is degenerate
-    degeneracy_direction : (k,) unit eigenvector of the worst direction, twist order, source's frame
+    degeneracy_direction : (k,) unit eigenvector of the worst direction, twist order, source's frame, or empty
     cause : the reason without its figures, the same for all of its kind
     variance_factor : ratio of ``covariance`` to the inverse of ``information``, at most 1: in the plane the latter
         assumes ``matching.sensor_noise_m`` where residuals are smaller
@@ -202,15 +202,15 @@ class Match:
     cost: float
     inliers: int
     points: int
-    iterations: int
-    residual_m: float
-    fit: float
-    at_minimum: bool
-    converged: bool
-    reason: str
-    degeneracy_eigenvalue: float
-    observability: float
-    degeneracy_direction: NDArray[np.float64]
+    iterations: int = 1
+    residual_m: float = math.nan
+    fit: float = 1.0
+    at_minimum: bool = True
+    converged: bool = True
+    reason: str = "converged"
+    degeneracy_eigenvalue: float = 1.0
+    observability: float = 1.0
+    degeneracy_direction: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     cause: str = ""
     variance_factor: float = 1.0
     systematic: Matrix = field(default_factory=lambda: np.empty((0, 0)))

@@ -34,14 +34,23 @@ class Placement:
     """
 
     def __init__(
-        self, config: LoopsConfig, closer: LoopCloser, schedule: Schedule, keyframes: Sequence[Keyframe]
+        self,
+        config: LoopsConfig,
+        closer: LoopCloser,
+        schedule: Schedule,
+        keyframes: Sequence[Keyframe],
+        first: int,
     ) -> None:
-        """Begin before the first scan; ``keyframes`` are those of the graph, which the caller adds to."""
+        """Begin before the first scan.
+
+        keyframes : those of the graph, which the caller adds to
+        first : number of the first keyframe of the log, after those of a prior map
+        """
         self.config, self.closer, self.schedule, self.keyframes = config, closer, schedule, keyframes
         self.graph = schedule.graph
         self.closures = ClosureTable()
         self.T_world_odom = lie.identity(self.graph.dimension)
-        self.first = 0  # number of the first keyframe of the log, after those of the map
+        self.first = first
         self.evidence = PlaceTest(closer.segments)
         self.rival = PlaceTest(closer.segments)  # of another location in the map, while the log has no match
         self.by_map: Closure | None = None  # the closure with the map of the newest keyframe that has one

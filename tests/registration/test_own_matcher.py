@@ -122,7 +122,7 @@ def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, name, words):
         ("information=np.eye(k)", "information=np.eye(6)", r"information has the shape \(6, 6\); wanted \(3, 3\)"),
         ("T_target_source=T,", "T_target_source=2.0 * T,", "T_target_source is not a rigid transformation"),
         ("inliers=inliers,", "inliers=None,", "inliers is None; wanted a whole number"),
-        ("fit=1.0,", "fit='good',", "fit is 'good'; wanted a number"),
+        ("inliers=inliers,", "inliers=inliers, fit='good',", "fit is 'good'; wanted a number"),
     ],
 )
 def test_one_that_returns_something_else_is_one_line_that_names_it(folder, old, new, words):

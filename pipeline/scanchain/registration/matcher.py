@@ -65,11 +65,12 @@ class CheckedMatcher:
             if not isinstance(value, int | np.integer if field in _COUNTS else int | float | np.number):
                 wanted = "a whole number" if field in _COUNTS else "a number"
                 raise InputError(f"{of} {field} is {shown(value)}; wanted {wanted}")
+        worst = match.degeneracy_direction if np.size(match.degeneracy_direction) else np.zeros(k)
         return replace(
             match,
             T_target_source=checks.pose(match.T_target_source, f"{of} T_target_source", d),
             information=checks.matrices(match.information, f"{of} information", (k, k)),
-            degeneracy_direction=checks.matrices(match.degeneracy_direction, f"{of} degeneracy_direction", (k,)),
+            degeneracy_direction=checks.matrices(worst, f"{of} degeneracy_direction", (k,)),
         )
 
 
