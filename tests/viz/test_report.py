@@ -157,11 +157,8 @@ def test_a_run_says_its_verdict_and_result_first_and_its_time_last(one_run, page
         "Time per scan", "How it was made",
     ]  # fmt: skip
     facts = re.findall(r"<dt>(.*?)</dt>", text)
-    assert facts[:3] == ["scans", "trajectory", "expected ATE"] and facts[-3:] == [
-        "configuration",
-        "machine",
-        "made",
-    ]
+    assert facts[0] == "scans" and {"trajectory", "expected ATE", "ATE"} < set(facts)
+    assert facts[-3:] == ["configuration", "machine", "made"]
     metrics = msgspec.json.decode((one_run / "metrics.json").read_bytes(), type=Metrics)
     assert 'class="verdict trustworthy"' in text and metrics.verdict_error in text
     assert re.fullmatch(r"ATE \d\.\d{3} to \d\.\d{3} m", metrics.verdict_error)
