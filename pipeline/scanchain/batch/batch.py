@@ -47,11 +47,9 @@ Work = Callable[[Sequence[Task]], Iterator[Row]]
 class Batch:
     """Logs to run, with configuration and limits.
 
-    logs : files, folders or addresses
-    out : the batch's directory, created or resumed
+    out : created or resumed
     config_file, overrides : for every log; arguments : these and others, for ``scanchain run``
-    workers : processes at a time on this machine
-    time_s : time limit per log; memory_mib : memory limit per log, None for an equal share of the free memory
+    time_s, memory_mib : limits per log; None for an equal share of the free memory
     retries : further tries of a log whose process crashed
     """
 

@@ -48,9 +48,7 @@ class Task(Struct, frozen=True):
 
     log : file, folder or address; identity : hash of its path, size and time of change, empty if unreadable
     key : hash of its identity and of everything that determines the result
-    out : the batch's directory
-    arguments : for ``scanchain run``
-    limits : limits of its process
+    out : the batch's directory; arguments : for ``scanchain run``
     retries : further tries after a crash
     """
 

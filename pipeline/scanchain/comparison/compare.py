@@ -36,17 +36,12 @@ _SHARED = "scans"  # in the directory until it is complete: what all methods rea
 class Comparison:
     """A log and the methods to compare on it.
 
-    logs : the files of one log
-    out : the directory to make
     methods : names, empty for all that apply; matcher : another one, as in the configuration
     config_file : sections of the configuration and one table per method; overrides : keys of the configuration,
         for the log and all of ours
     ground_truth : a TUM or KITTI file; None for the log's own
-    relations : a file of relations
     repeat : runs of every method, interleaved
     time_s, memory_mib : limits of a run; None for the default ones
-    force : whether a directory of that name is replaced
-    command : the command line, for the report
     """
 
     logs: tuple[Source, ...]

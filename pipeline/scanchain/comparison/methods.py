@@ -29,7 +29,6 @@ _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configurati
 class Method(Struct, frozen=True):
     """One row of a comparison.
 
-    name : what the tables call it
     base : one of OURS or BASELINES, or MODULE:CLASS with a Baseline's methods (in 2D of points (N, 2) and poses
         (3, 3)), which is given the settings as keywords
     settings : as TOML holds them; for ours the configuration by section, except those that all methods share

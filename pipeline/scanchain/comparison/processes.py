@@ -130,7 +130,6 @@ class EndReport(Struct, frozen=True):
     start_s : import, loading what is compiled, and a throwaway instance on the first scans
     finish_s : after the last scan, as for the last optimization
     peak_mib : of its resident memory, interpreter and packages included
-    has_compiled : whether kernels were compiled in between, so that its times are not valid
     """
 
     status: Status
@@ -139,14 +138,12 @@ class EndReport(Struct, frozen=True):
     start_s: float = 0.0
     finish_s: float = 0.0
     peak_mib: float = 0.0
-    has_compiled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """A run of a method.
 
-    report : how it ended
     odometry : (N, d+1, d+1) pose of each scan right after it was processed; NaN from the failure on
     trajectory : final poses, equal to ``odometry`` except with loop closures; empty if it did not finish
     seconds, cpu_seconds : (N,) wall-clock and CPU time (all threads) per scan; NaN like the poses
@@ -177,11 +174,6 @@ def run_all(
             if any(outcome.report.status is Status.MISSING for outcome in outcomes[method.name]):
                 continue
             outcome = _run(method, scans, folder / f"run_{turn}_{place}", limits)
-            if outcome.is_whole and outcome.report.has_compiled:
-                progress.announce(
-                    f"{method.name}: has compiled its kernels, once after the installation; repeating it"
-                )
-                outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
             outcomes[method.name].append(outcome)
             which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
             end = f"{outcome.report.status}: {outcome.report.reason}"

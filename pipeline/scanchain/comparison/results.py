@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -66,8 +67,7 @@ class Assessed:
     T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
         end; the identity without truth
     by_scan : (N,) ``error_m``, ``error_rad`` and ``nees``, NaN where a scan has no paired true pose
-    relations : the error over relations; None without any, or after a failure
-    definitions : of the figures, as text
+    relations : None without any, or after a failure
     """
 
     figures: dict[str, float | None]
@@ -135,12 +135,10 @@ def _steps(outcome: Outcome, *columns: str) -> pa.Table | None:
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
     """True first pose of a method that begins with the identity."""
-    if truth is None:
-        return np.eye(4)
-    try:
-        return evaluation.pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
-    except InputError:  # the truth begins later
-        return np.eye(4)
+    with suppress(InputError):  # the truth begins later
+        if truth is not None:
+            return evaluation.pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
+    return np.eye(4)
 
 
 def _speed(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
@@ -204,8 +202,10 @@ def results_of(
 
 def write_results(folder: Path, results: Results) -> None:
     """Write the per-scan tables, and a folder per method with trajectory, map, tables, and its output."""
-    _write_tables(folder / SCANS_FILE, _scans(results), _NOTES)
-    _write_tables(folder / RELATIONS_FILE, _relations(results.assessed))
+    scans, relations = _scans(results).replace_schema_metadata(_NOTES), _relations(results.assessed)
+    pq.write_table(scans, folder / SCANS_FILE, compression="zstd")
+    if relations:
+        pq.write_table(pa.concat_tables(relations), folder / RELATIONS_FILE, compression="zstd")
     if results.reference.truth is not None:
         write_tum(folder / TRUTH_FILE, evaluation.during(results.reference.truth, results.scans.stamps_ns))
     settings = {method.name: {"method": method.base} | method.settings for method in results.methods}
@@ -234,11 +234,6 @@ def _write_method(own: Path, results: Results, name: str) -> None:
             shutil.copy(source, own / file)
 
 
-def _write_tables(path: Path, tables: Sequence[pa.Table], notes: Mapping[str, str] | None = None) -> None:
-    if tables:
-        pq.write_table(pa.concat_tables(tables).replace_schema_metadata(notes), path, compression="zstd")
-
-
 def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
     tables = []
     for name, each in assessed.items():
@@ -248,7 +243,7 @@ def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
     return tables
 
 
-def _scans(results: Results) -> list[pa.Table]:
+def _scans(results: Results) -> pa.Table:
     """The scans of all runs, each run with its own errors; failed runs up to the failure."""
     tables = []
     for name, outcomes in results.outcomes.items():
@@ -257,7 +252,7 @@ def _scans(results: Results) -> list[pa.Table]:
             if outcome is not representative(outcomes):
                 assessed = assess([outcome], results.scans.stamps_ns, results.reference)
             tables.append(_table(name, repeat, outcome, assessed, results.scans.stamps_ns))
-    return tables
+    return pa.concat_tables(tables)
 
 
 def _table(name: str, repeat: int, outcome: Outcome, assessed: Assessed, stamps_ns: NDArray[np.int64]) -> pa.Table:

@@ -30,14 +30,11 @@ class Shown(Struct, frozen=True):
 class Column(Struct, frozen=True):
     """Presentation of a figure.
 
-    key : of the figure
-    head, unit : its heading
     scale : from the figure's unit to the shown one
     digits : after the point, at most
-    better : which values are marked as the best; none of a figure that is not about accuracy or cost, as the NEES
-        of a bad method may be near 1
+    better : which values are the best; none of a figure that is not about accuracy or cost, as the NEES of a bad
+        method may be near 1
     table : the summary, which the short tables are, or one of the two that hold the rest
-    definition : its meaning, in a sentence
     """
 
     key: str
@@ -139,7 +136,6 @@ class Row(Struct, frozen=True):
     status, reason : of the first run that did not end well, else ok
     figures : by key of COLUMNS, None where unknown
     settings : whole, as a TOML file for --config would hold them
-    definitions : of its errors, as text
     verdict, verdict_reason : on its trajectory, of other tools by wheels and constant velocity; empty if it failed
     verdict_error : the error bound that the verdict states
     """
@@ -176,7 +172,6 @@ class Row(Struct, frozen=True):
 class Table(Struct, frozen=True):
     """A comparison.
 
-    log, topic : what was read, for headings
     truth : reference of the errors; empty without ground truth
     truth_note : how many scans have no true pose, or why a truth could not be used; else empty
     disagreement_m : row by row the median distance between two methods' motions; None where one has failed

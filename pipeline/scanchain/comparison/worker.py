@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Iterable
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from time import perf_counter, process_time
@@ -21,7 +21,6 @@ from numpy.lib.format import open_memmap
 
 from scanchain import plugins
 from scanchain.baselines import BASELINES, InPlane
-from scanchain.clock import announcing_compilation
 from scanchain.comparison import processes
 from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import EndReport, Status, StoredScans
@@ -116,10 +115,7 @@ def run(folder: Path) -> None:
     """Run the task of a folder and write the report."""
     task = (folder / processes.TASK_FILE).read_bytes()
     method, scans = processes.decode(task, tuple[Method, StoredScans])
-    compiled: list[str] = []
-    with announcing_compilation(compiled.append) if method.is_ours else nullcontext():
-        report = _report(scans, method, folder)
-    report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=bool(compiled))
+    report = msgspec.structs.replace(_report(scans, method, folder), peak_mib=peak_mib())
     (folder / processes.REPORT_FILE).write_bytes(msgspec.json.encode(report))
 
 

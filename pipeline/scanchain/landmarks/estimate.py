@@ -11,7 +11,7 @@ from scanchain.data import Matrix
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.losses import RobustLoss
 from scanchain.graph.minimizer import Descent, LocalModel, Optimizer, descend, step_rule
-from scanchain.landmarks.problem import BearingRangeProblem, Linearization, LinearSystem, Measurements, Values
+from scanchain.landmarks.problem import BearingRangeProblem, Linearization, Measurements, Values
 from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
 
 _FIRST, _GROWTH = 16, 2  # number of poses of the first part, and growth factor of each further one
@@ -117,9 +117,9 @@ _SCALE2 = _FREEDOM + 2.0  # up to a factor absorbed by σ, the weight (ν + 2) /
 
 @dataclass(frozen=True, slots=True)
 class StudentLoss:
-    """Student's t loss ρ(χ²) of a bearing and a range jointly, ν = 4, times the share of the observation.
+    """Student's t loss ρ(χ²) of a bearing and a range jointly, ν = 4.
 
-    share : (N,) weight as a share of that of an independent observation, above 0 up to 1
+    share : (N,) factor of each observation, the share of an independent one that it counts as, above 0 up to 1
     """
 
     share: NDArray[np.float64]
@@ -133,7 +133,6 @@ class StudentLoss:
         return self.share * _SCALE2 * np.log1p(chi2 / _SCALE2)
 
 
-Loss = RobustLoss | StudentLoss
 QUADRATIC = RobustLoss("none", 1.0, 1.0)
 
 
@@ -158,7 +157,7 @@ def minimize(
     guess: Values,
     solver: LinearSolver,
     *,
-    loss: Loss = QUADRATIC,
+    loss: RobustLoss | StudentLoss = QUADRATIC,
     optimizer: Optimizer = "levenberg-marquardt",
     max_iterations: int = 100,
     tolerance: float = 1e-10,
@@ -177,7 +176,21 @@ def minimize(
         return Evaluation(state, at, loss.weight(chi2), quadratic + float(loss.loss(chi2).sum()))
 
     def model_at(now: Evaluation) -> LocalModel:
-        return _model(problem, solver, problem.system(now.at, now.weights))
+        """H = AᵀA and g = −Aᵀb."""
+        system = problem.system(now.at, now.weights)
+        lengths = np.bincount(system.pattern.columns, system.values**2, system.pattern.shape[1])
+        A, diagonal = system.A, np.asarray(lengths, np.float64)
+
+        def solve(damping: float) -> NDArray[np.float64]:
+            if not damping:
+                return solver.solve(system)
+            try:
+                return solver.solve(problem.damped(system, damping * diagonal))
+            except UndeterminedError as error:
+                column = int(error.columns[0])
+                raise SingularMatrixError(column, column) from error
+
+        return LocalModel(-(A.T @ system.b), diagonal, solve, lambda step: A.T @ (A @ step))
 
     return descend(
         model_at,
@@ -187,21 +200,3 @@ def minimize(
         max_iterations,
         tolerance,
     )
-
-
-def _model(problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> LocalModel:
-    """H = AᵀA and g = −Aᵀb."""
-    A = system.A
-    lengths = np.bincount(system.pattern.columns, system.values**2, system.pattern.shape[1])
-    diagonal = np.asarray(lengths, np.float64)
-
-    def solve(damping: float) -> NDArray[np.float64]:
-        if not damping:
-            return solver.solve(system)
-        try:
-            return solver.solve(problem.damped(system, damping * diagonal))
-        except UndeterminedError as error:
-            column = int(error.columns[0])
-            raise SingularMatrixError(column, column) from error
-
-    return LocalModel(-(A.T @ system.b), diagonal, solve, lambda step: A.T @ (A @ step))

@@ -20,9 +20,8 @@ Kind = Literal["linear", "bearing-range"]
 class LandmarkData:
     """A landmark problem in the plane, positions only: headings are known, everything is in the world's axes.
 
-    name : of the file
     kind : whether an observation is the landmark's position relative to the pose, or its bearing and range
-    measurements : of poses without headings; ``measured`` is relative x, y in m in a linear problem
+    measurements : ``measured`` is relative x, y in m in a linear problem
     true_poses, true_landmarks : (K, 2), (L, 2) m; (0, 2) and NaN where unknown
     """
 
@@ -67,10 +66,8 @@ _COMPONENTS = ("x", "y", "heading")
 class Layout:
     """Columns of A: pose after pose, the robot's calibration, landmark after landmark.
 
-    poses : how many
     pose_size : unknowns of a pose, 2 (x, y) or 3 (x, y, heading)
-    landmarks : (L,) their names, as numbers
-    calibration : names of the calibration unknowns
+    landmarks : (L,) their names, as numbers; calibration : names of its unknowns
     """
 
     poses: int
@@ -82,11 +79,6 @@ class Layout:
     def split(self) -> int:
         """Number of columns of the poses, which come before all others."""
         return self.poses * self.pose_size
-
-    @property
-    def bandwidth(self) -> int:
-        """Largest distance between two columns of poses in one row: odometry joins successive poses only."""
-        return 2 * self.pose_size - 1
 
     @property
     def landmark_start(self) -> int:
@@ -222,7 +214,6 @@ class Linearization:
 class Calibration:
     """Unknowns common to all motions of the robot.
 
-    names : (C,) of the unknowns
     value : (C,) at which the motions were computed; slope (K − 1, p, C) their derivative by the unknowns
     sigma : (C,) prior about zero
     """
@@ -245,7 +236,6 @@ class Measurements:
     first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
     motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
         of the former, without in the world's
-    calibration : errors common to all motions
     observed : (N, 2) pose, landmark
     measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; one covariance for all
     landmarks : (L,) their names, as numbers

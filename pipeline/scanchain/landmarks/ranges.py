@@ -208,8 +208,6 @@ class RangeSolution:
     problem, guess, minimum : problem with the estimated noise; initial guess of the first minimization; result of
         the last one, with the first pose at the origin
     variances : (6,) of the odometry's sources as in ``OdometryNoise``, of bearing and range
-    loss : loss of the observations, with the share of each
-    covariance, consistency : at the minimum
     iterations, time_s : steps after the guess; total time, without reading
     """
 
@@ -260,12 +258,8 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
         )
 
     stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
-    reckoning, variances, loss = (
-        reckon(log, nodes_s, np.zeros(len(OWN))),
-        stated,
-        StudentLoss(np.ones(len(observed))),
-    )
-    problem = BearingRangeProblem(measurements(reckoning, stated))
+    reckoning, variances = reckon(log, nodes_s, np.zeros(len(OWN))), stated
+    loss, problem = StudentLoss(np.ones(len(observed))), BearingRangeProblem(measurements(reckoning, stated))
     reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
     state, iterations, turn, is_last = guess, 0, 0, False
     while True:

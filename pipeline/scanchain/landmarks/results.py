@@ -10,14 +10,12 @@ import numpy as np
 
 from scanchain.data import Matrix
 from scanchain.errors import counted
-from scanchain.landmarks.solvers import MethodResult
 from scanchain.landmarks.study import Estimate, Study
 from scanchain.trajectory import write_tum
 
 _HEADINGS = (
     "method", "build ms", "factor ms", "solve ms", "total ms", "again ms", "solves", "nnz factor", "differs by",
 )  # fmt: skip
-_FIGURES = ("method", "build_s", "factor_s", "solve_s", "again_s", "iterations")
 
 
 def file_stem(name: str) -> str:
@@ -27,19 +25,14 @@ def file_stem(name: str) -> str:
 
 def table_of(study: Study) -> list[tuple[str, ...]]:
     """Headings, then one row per method; without the column of differences for a single method."""
-    rows = [_HEADINGS, *(_row(method) for method in study.methods)]
+    rows: list[tuple[str, ...]] = [_HEADINGS]
+    for each in study.methods:
+        times_s = (each.build_s, each.factor_s, each.solve_s, each.total_s, each.again_s)
+        counts = str(each.iterations), f"{each.factor.nnz:,}"
+        rows.append(
+            (each.method, *(f"{1e3 * time_s:.2f}" for time_s in times_s), *counts, f"{each.difference:.1e}")
+        )
     return rows if len(study.methods) > 1 else [row[:-1] for row in rows]
-
-
-def _row(method: MethodResult) -> tuple[str, ...]:
-    times = (method.build_s, method.factor_s, method.solve_s, method.total_s, method.again_s)
-    return (
-        method.method,
-        *(f"{1e3 * seconds:.2f}" for seconds in times),
-        str(method.iterations),
-        f"{method.factor.nnz:,}",
-        f"{method.difference:.1e}",
-    )
 
 
 def text_of(study: Study) -> str:
@@ -75,6 +68,7 @@ def accuracy_lines(study: Study) -> list[tuple[str, str]]:
 def tree_of(study: Study) -> dict[str, object]:
     """The figures for JSON."""
     rows, columns = study.system.pattern.shape
+    names = ("method", "build_s", "factor_s", "solve_s", "again_s", "iterations")
     return {
         "name": study.name,
         "facts": study.facts,
@@ -84,7 +78,7 @@ def tree_of(study: Study) -> dict[str, object]:
         "A": {"rows": rows, "columns": columns, "entries": len(study.system.values), "build_s": study.build_s},
         "methods": [
             {
-                **{name: getattr(method, name) for name in _FIGURES},
+                **{name: getattr(method, name) for name in names},
                 "factor": method.factor.name,
                 "factor_entries": method.factor.nnz,
                 "difference": method.difference,
@@ -96,20 +90,17 @@ def tree_of(study: Study) -> dict[str, object]:
 
 def write_estimate(directory: Path, study: Study) -> None:
     """Poses and landmarks with their covariances as CSV, and the poses as TUM where they have stamps."""
-    stem, state = file_stem(study.name), study.after.state
-    names = ["x_m", "y_m", "heading_rad"][: state.poses.shape[1]]
-    file, numbers = directory / f"{stem}_poses.csv", np.arange(len(state.poses))
-    _write_csv(file, "pose", numbers, names, state.poses, study.covariance.poses)
-    file, numbers = directory / f"{stem}_landmarks.csv", study.system.pattern.layout.landmarks
-    _write_csv(file, "landmark", numbers, names[:2], state.landmarks, study.covariance.landmarks)
+    stem, state, covariance = directory / file_stem(study.name), study.after.state, study.covariance
+    _write_csv(f"{stem}_poses.csv", "pose", np.arange(len(state.poses)), state.poses, covariance.poses)
+    names = study.system.pattern.layout.landmarks
+    _write_csv(f"{stem}_landmarks.csv", "landmark", names, state.landmarks, covariance.landmarks)
     if study.trajectory is not None:
-        write_tum(directory / f"{stem}.tum", study.trajectory, force=True)
+        write_tum(Path(f"{stem}.tum"), study.trajectory, force=True)
 
 
-def _write_csv(
-    path: Path, kind: str, numbers: np.ndarray, names: list[str], values: Matrix, covariance: Matrix
-) -> None:
+def _write_csv(path: str, kind: str, numbers: np.ndarray, values: Matrix, covariance: Matrix) -> None:
     """One line each: number, values, upper triangle of the covariance."""
+    names = ["x_m", "y_m", "heading_rad"][: values.shape[1]]
     rows, columns = np.triu_indices(len(names))
     header = [kind, *names, *(f"cov_{names[i]}_{names[j]}" for i, j in zip(rows, columns, strict=True))]
     table = np.column_stack([numbers, values, covariance[:, rows, columns]])

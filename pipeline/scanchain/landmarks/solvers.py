@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -56,8 +56,7 @@ class LinearSolver:
     A method builds what it factorizes, AᵀA and Aᵀb or the order of A. If A lacks full column rank it raises
     SingularMatrixError or RuntimeError.
 
-    spent_s : (3,) time of all solutions so far: to build, to factor with all analysis, to solve triangular systems
-    solutions : their number
+    spent_s : (3,) time of all ``solutions``: to build, to factor with all analysis, to solve triangular systems
     """
 
     def __init__(self, method: Method) -> None:
@@ -177,7 +176,11 @@ class CholeskyMethod:
     build = staticmethod(normal_equations)
 
     def __init__(self) -> None:
-        self._analyzed = lru_cache(maxsize=1)(_cholesky_of)
+        def analyzed(pattern: Pattern) -> SparseCholesky:
+            squared = pattern.squared()
+            return SparseCholesky(squared, analyze(squared))
+
+        self._analyzed = lru_cache(maxsize=1)(analyzed)
 
     def factorize(self, system: LinearSystem, built: tuple[csc_matrix, NDArray[np.float64]]) -> Factored:
         """U with AᵀA = UᵀU."""
@@ -187,11 +190,6 @@ class CholeskyMethod:
         cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
         U, order = upper_factor, cholesky.analysis.order
         return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
-
-
-def _cholesky_of(pattern: Pattern) -> SparseCholesky:
-    squared = pattern.squared()
-    return SparseCholesky(squared, analyze(squared))
 
 
 class QrMethod:
@@ -315,9 +313,8 @@ def _form(system: LinearSystem) -> tuple[Arrow, NDArray[np.float64]]:
     """AᵀA as an arrow, and Aᵀb."""
     pattern, layout = system.pattern, system.pattern.layout
     n, split = layout.columns, layout.split
-    H = Arrow(
-        np.zeros((layout.bandwidth + 1, split)), np.zeros((split, n - split)), np.zeros((n - split, n - split))
-    )
+    width = 2 * layout.pose_size  # of the band, since odometry joins successive poses only
+    H = Arrow(np.zeros((width, split)), np.zeros((split, n - split)), np.zeros((n - split, n - split)))
     g = np.zeros(n)
     algebra.products(
         pattern.row_start, pattern.columns, system.values, system.b, split, H.band, H.border, H.corner, g
@@ -345,12 +342,9 @@ def _factor_of_arrow(U: Arrow) -> Factor:
 
 
 _MAKERS = {
-    "default": lambda: ScipyMethod("default"),
-    "pinv": lambda: ScipyMethod("pinv"),
-    "lu": lambda: ScipyMethod("lu"),
-    "lu_colamd": lambda: ScipyMethod("lu_colamd"),
-    "qr": lambda: QrMethod(is_natural=True),
-    "qr_colamd": lambda: QrMethod(is_natural=False),
+    **{name: partial(ScipyMethod, name) for name in ("default", "pinv", "lu", "lu_colamd")},
+    "qr": partial(QrMethod, is_natural=True),
+    "qr_colamd": partial(QrMethod, is_natural=False),
     "cholesky": CholeskyMethod,
     "schur": SchurMethod,
 }
@@ -398,11 +392,9 @@ _SLOW_S = 1.0  # seconds of a solution above which it is not repeated
 class MethodResult:
     """One method on one problem.
 
-    method : its name
     build_s, factor_s, solve_s : medians over the repetitions, each with a new solver; sums over the iterations
     again_s : the whole solution repeated with the same solver, which reuses its analysis of the pattern
-    iterations : linear solves
-    factor : of the last solve
+    iterations : linear solves; ``factor`` is of the last one
     x : (n,) the unknowns
     difference : largest entry of x minus that of the first method
     """

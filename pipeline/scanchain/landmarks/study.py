@@ -99,8 +99,6 @@ def _rms(differences: Matrix) -> float:
     return float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else float("nan")
 
 
-Guess = Literal["odometry", "disturbed", "origin"]
-
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 _DOWNWEIGHTED = 0.25  # share of its expected weight below which an observation is reported as downweighted
 _FITS = (0.5, 2.0)  # range of χ² per degree of freedom in which a noise model fits
@@ -119,7 +117,7 @@ class Options:
     repeats: int
     robot: int
     noise: OdometryNoise | None
-    guess: Guess
+    guess: Literal["odometry", "disturbed", "origin"]
     optimizer: Optimizer
 
 
@@ -127,13 +125,10 @@ class Options:
 class Study:
     """Results of a study.
 
-    name, facts : name of the problem, and descriptive lines by label
-    before, after : estimates before and after optimization
-    converged : whether the optimization converged
-    covariance : of poses and landmarks after optimization
+    facts : descriptive lines by label
+    covariance : after optimization
     true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown
     system, build_s : A x = b as the methods solved it, and the time to assemble it
-    methods : result of every method
     trajectory : the poses after optimization with their stamps; None for a file, which has no stamps
     """
 
@@ -177,7 +172,11 @@ def _linear(data: LandmarkData, options: Options) -> Study:
 
 def _nonlinear(data: LandmarkData, options: Options) -> Study:
     problem = BearingRangeProblem(data.measurements)
-    guess = _guess(problem, options.guess)
+    guess = from_odometry(problem.measurements)
+    if options.guess == "disturbed":
+        guess = disturbed(guess, _SHIFT_M, _TURN_RAD)
+    elif options.guess == "origin":
+        guess = replace(guess, landmarks=np.zeros_like(guess.landmarks))
     names, left_out = methods_for(options.methods, problem.pattern.shape[1])
     minimum = minimize(problem, guess, create_solver(names[0]), optimizer=options.optimizer)
     begin = working_s()
@@ -203,21 +202,11 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
     )  # fmt: skip
 
 
-def _guess(problem: BearingRangeProblem, guess: Guess) -> Values:
-    state = from_odometry(problem.measurements)
-    if guess == "disturbed":
-        return disturbed(state, _SHIFT_M, _TURN_RAD)
-    if guess == "origin":
-        return replace(state, landmarks=np.zeros_like(state.landmarks))
-    return state
-
-
 def _chi2(chi2: float, system: LinearSystem) -> str:
     """χ² over its degrees of freedom, and its meaning."""
     rows, unknowns = system.pattern.shape
     freedom = max(rows - unknowns, 1)
-    low, high = _FITS
-    is_fit = low <= chi2 / freedom <= high
+    is_fit = _FITS[0] <= chi2 / freedom <= _FITS[1]
     verdict = "the noise model fits" if is_fit else "the noise model does not fit, or a poor minimum"
     return f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}"
 
@@ -252,25 +241,25 @@ def study_log(folder: Path, options: Options) -> Study:
 
 
 def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[str, str]:
-    noise = solution.consistency
-    count = len(log.seen_s)
-    share = solution.loss.share.sum()
-    worth = f"count as {share:.0f}, as errors of a landmark's successive sightings are correlated"
+    noise, estimate, share = solution.consistency, solution.minimum.estimate, solution.loss.share
     nodes = counted(len(solution.nodes_s), "pose")
-    seen = f"{count:,} of {len(solution.minimum.estimate.state.landmarks)} landmarks from {nodes}; they {worth}"
-    left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
     forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m = solution.sigmas
     wheels = (
         f"{forward_m:.3g} m forward, {sideways_m:.3g} m sideways, {drift_rad:.3g} rad"
         f" after a meter, {turn_rad:.3g} rad after a radian"
     )
-    own = zip(OWN, solution.minimum.estimate.state.calibration, OWN_UNITS, strict=True)
+    own = zip(OWN, estimate.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
-    downweighted = int(np.count_nonzero(solution.minimum.estimate.weights < _DOWNWEIGHTED * solution.loss.share))
+    downweighted = int(np.count_nonzero(estimate.weights < _DOWNWEIGHTED * share))
     state, sensor = "stated" if is_stated else "estimated", float(np.mean(noise.sensor / noise.sensor_freedom))
     return {
-        "observations": seen,
-        "left out": left,
+        "observations": (
+            f"{len(log.seen_s):,} of {len(estimate.state.landmarks)} landmarks from {nodes}; they count as "
+            f"{share.sum():.0f}, as errors of a landmark's successive sightings are correlated"
+        ),
+        "left out": (
+            f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
+        ),
         "estimate": f"{1e3 * solution.time_s:.0f} ms, {_ended(solution.minimum, solution.iterations)}",
         "robot": "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own),
         "odometry noise": f"{state}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
@@ -283,6 +272,5 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[s
 
 def _verdict(chi2: float) -> str:
     """χ² per degree of freedom as text."""
-    low, high = _FITS
-    verdict = "fits" if low <= chi2 <= high else f"off by a factor {chi2**0.5:.2f}"
+    verdict = "fits" if _FITS[0] <= chi2 <= _FITS[1] else f"off by a factor {chi2**0.5:.2f}"
     return f"χ² per degree of freedom {chi2:.2f}: {verdict}"
