@@ -257,7 +257,7 @@ def test_undistorted_with_the_truth_every_point_lies_on_the_first_surface(world,
     at = poses[sweep.returned]
     points = np.einsum("nij,nj->ni", at[:, :3, :3], sweep.points().astype(np.float64)) + at[:, :3, 3]
     random = np.random.default_rng(1)
-    some = random.choice(len(points), min(len(points), 500), replace=False)
+    some = random.choice(len(points), min(len(points), 1500), replace=False)
     assert len(points) > (0.4 if world == "field" else 0.5) * len(sweep.ranges_m)
     assert naive_raycast.distance_to_surface(points[some], drive.solids).max() < 1e-5
     few, reach_m = random.choice(len(poses), 8, replace=False), drive.sensor.max_range_m
