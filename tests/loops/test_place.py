@@ -12,10 +12,9 @@ from scanchain.data import ClosureVerdict, Keyframe, Proposal
 from scanchain.kernels.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser, outline_of
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.map_search import PLACES_FILE, UprightMap
-from scanchain.loops.outline import OutlineRecognizer
 from scanchain.loops.recognizer import Query
 from scanchain.loops.submaps import VoxelSubmaps, level_frame, submap_around
+from scanchain.loops.upright_search import PLACES_FILE, OutlineRecognizer, UprightMap
 from scanchain.loops.verification import Verifier, free_space_agreement
 from scanchain.registration import VoxelMap
 from scanchain.simulation import plan

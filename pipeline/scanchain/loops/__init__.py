@@ -3,7 +3,7 @@
 from scanchain.loops.closer import LoopCloser
 from scanchain.loops.closure_table import ClosureTable
 from scanchain.loops.evidence import PlaceTest
-from scanchain.loops.map_search import level_of, outline_of
 from scanchain.loops.refinement import refined, spread
+from scanchain.loops.upright_search import level_of, outline_of
 
 __all__ = ["ClosureTable", "LoopCloser", "PlaceTest", "level_of", "outline_of", "refined", "spread"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,12 @@ from scanchain.config import Config, LoopsConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Drift, Segments
-from scanchain.loops.map_search import UprightFinder
 from scanchain.loops.place_search import PlaceSearch
 from scanchain.loops.planar_map_search import PlanarFinder
 from scanchain.loops.recognizer import PlaceCloser
-from scanchain.loops.submaps import VoxelSubmaps, seen_together
+from scanchain.loops.submaps import VoxelSubmaps
+from scanchain.loops.upright_search import UprightFinder
 from scanchain.loops.verification import Verifier
-from scanchain.preprocess import downsample
-from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
 
 _KEPT_M = 10.0  # distance from the anchor of a map's submap up to which it stays the target, at full scale
 _LARGE = 2000  # number of keyframes above which those of one pass are preferred to the nearest one
@@ -32,9 +29,6 @@ _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans ar
 
 _BASIN_M = 0.5  # largest uncertainty that matching corrects without a search
 _INTERVAL = 0.2  # share of the uncertainty that is traveled between two searches: wide windows cost most
-_RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of uncertainty
-_MIN_RAD = 0.1  # least half width of the window in heading
-_WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # a second answer means ambiguity
 
 
 class LoopCloser:
@@ -176,7 +170,11 @@ class ProximityCloser:
         if uncertainty_m is None:
             near, uncertainty_m = self._near(graph, old, connected)
         radius_m = float(uncertainty_m[near].max())
-        found = self._within_drift(self.finder, keyframes, T_world, near, radius_m, old)
+        if radius_m <= _BASIN_M:
+            return (closure,)
+        self.next_m = keyframes[newest].traveled_m + _INTERVAL * radius_m
+        path = keyframes[max(len(keyframes) - self.submaps.half_width, self.of_map) :]  # the map has another frame
+        found = self.finder.within_drift(path, keyframes[:old], T_world, near=near, radius_m=radius_m)
         return (closure,) if found is None else (closure, found)
 
     def in_map_at(self, T_world_newest: Pose, keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
@@ -194,39 +192,6 @@ class ProximityCloser:
         submap, newest = self.submaps.around(target, keyframes, old - 1), keyframes[-1]
         verified = self.verifier.scan(newest, submap, T_first, in_map=target < self.of_map)
         return verified.closure(target, newest.index)
-
-    def _within_drift(
-        self,
-        finder: PlanarFinder,
-        keyframes: Sequence[Keyframe],
-        T_world: Matrix,
-        near: NDArray[np.int64],
-        radius_m: float,
-        old: int,
-    ) -> Closure | None:
-        """The closure of the newest keyframe by a correlative search over all poses that the drift allows.
-
-        None if it fits nowhere in the older keyframes together, or at two poses.
-        near : keyframes within reach; radius_m : uncertainty of the position relative to them; old : number of
-            keyframes that submaps may contain
-        """
-        if radius_m <= _BASIN_M:
-            return None
-        newest, submaps = keyframes[-1], self.submaps
-        self.next_m = newest.traveled_m + _INTERVAL * radius_m
-        size_m = submaps.config.voxel_size_m * newest.scale
-        placed = {k: replace(keyframes[k], T_odom_lidar=T_world[k]) for k in near.tolist()}
-        surfaces = seen_together(list(placed.values()), lie.identity(2))
-        grid = SearchGrid.of_points(downsample(surfaces, size_m), size_m)
-        first = max(len(keyframes) - submaps.half_width, self.of_map)  # those of a map are in another frame
-        points = seen_together(keyframes[first:], lie.inverse(newest.T_odom_lidar))
-        window = Window(T_world[-1], radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
-        found = find(thinned(points, size_m), grid, window, _WANTED)
-        if len(found) != 1:
-            return None
-        anchors = {submaps.anchor_of(k): None for k in placed}
-        on_map = [replace(keyframes[k], T_odom_lidar=T_world[k]) for k in anchors]
-        return finder.aligned(newest, found[0].T_target_source, on_map, keyframes[:old])
 
     def _near(
         self, graph: PoseGraph, old: int, connected: NDArray[np.bool_]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
@@ -11,7 +11,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.registration.search import Found, Search
@@ -132,10 +132,8 @@ class PlaceSearch(Generic[Map]):
 
     def finish(self) -> tuple[Closure, ...]:
         """Complete the search in progress, if any."""
-        closures: tuple[Closure, ...] = ()
-        while self.underway is not None:
-            closures = self.advance()
-        return closures
+        underway, self.underway = self.underway, None
+        return () if underway is None else tuple(completed(underway))
 
     def _search_targets(self, components: NDArray[np.int64], keyframes: Sequence[Keyframe]) -> NDArray[np.int64]:
         """Keyframes to search for the newest: those of one of the components that they are not joined to.
@@ -162,13 +160,16 @@ class PlaceSearch(Generic[Map]):
         return keyframes[-1].traveled_m - self.matched_m
 
 
-def searched(search: Search) -> Generator[None, None, Sequence[Found]]:
-    """The poses that a search finds, in slices of equal work, one per scan."""
+def candidates(
+    search: Search, refine: Callable[[Pose], Sequence[Found]]
+) -> Generator[None, None, Sequence[Found]]:
+    """The poses that a search finds, each refined, the best first; yields after slices of equal work."""
     search.advance()
     while not search.is_done:
         yield
         search.advance()
-    return search.poses()
+    refined = [fit for each in search.poses() for fit in refine(each.T_target_source)]
+    return sorted(refined, key=lambda each: -each.share)
 
 
 def completed(underway: Generator[None, None, Result]) -> Result:

@@ -1,28 +1,35 @@
-"""Search of a whole planar map for the points along a path, by its surfaces and its free space."""
+"""Place recognition in 2D: correlative scan matching, within the drift or in a map with its free space."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.config import MapsConfig
-from scanchain.data import Closure, Keyframe, Points, Pose, Problem, Proposal
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.kernels.search import FREE, NEAR, UNKNOWN
 from scanchain.loops.evidence import rank_of
-from scanchain.loops.place_search import Underway, completed, searched
+from scanchain.loops.place_search import Underway, candidates, completed
 from scanchain.loops.submaps import VoxelSubmaps, seen_together
 from scanchain.loops.verification import Verifier
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
-from scanchain.registration import SearchGrid, Wanted
+from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
 from scanchain.registration.search import Search, draw_surfaces
 
+# of the newest keyframes in older ones, within the drift
+_RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of uncertainty
+_MIN_RAD = 0.1  # least half width of the window in heading
+_WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # a second answer means ambiguity
+
+# of a path in a whole map
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
 _CERTAIN = 0.6  # log-odds of occupancy above which a cell is a surface, and below minus which it is free
 _POINTS, _MORE_POINTS = 120, 800  # number of points that poses are searched with and compared with
@@ -34,6 +41,8 @@ _CHANCE = 2.0  # over the root of the number of points: share above LEAST_SHARE 
 _CERTAINLY = 0.06  # least share above these for a location to count as found
 _CLEAR_M = 2.0  # least path since an ambiguous search for a location to count as found
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
+
+# of the scans of a path that was found
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest distance of an aligned scan from where its path was found
 _SOURCES, _SUBMAPS = 8, 6  # keyframes of the path that are aligned, about 1 m apart, and submaps tried for each
 _NEAR_M = 8.0  # largest distance of such a submap's anchor
@@ -104,11 +113,10 @@ class PlanarMapSearch:
         points = np.random.default_rng(0).permutation(downsample(points, self.resolution_m))
         search = Search(points[:_POINTS], self.grid, None, Wanted(_APART_M, _RIVAL, _ANSWERS, least))
         more, step_rad = points[:_MORE_POINTS].copy(), 0.5 * search.turn_rad
-        poses = yield from searched(search)
-        found = [self.grid.climbed(more, each.T_target_source, step_rad) for each in poses]
+        found = yield from candidates(search, lambda T: [self.grid.climbed(more, T, step_rad)])
         if not found:
             return None
-        best = max(found, key=lambda each: each.share)
+        best = found[0]
         apart = (each.share for each in found if _are_apart(each.T_target_source, best.T_target_source))
         return Hypothesis(best.T_target_source, best.share, max(apart, default=0.0), len(points))
 
@@ -156,6 +164,32 @@ class PlanarFinder:
             for source in path[:: -max(len(path) // _SOURCES, 1)][:_SOURCES]
         ]
         return sorted((each for each in closures if each is not None), key=rank_of, reverse=True)
+
+    def within_drift(
+        self,
+        path: Sequence[Keyframe],
+        old: Sequence[Keyframe],
+        T_world: Matrix,
+        *,
+        near: NDArray[np.int64],
+        radius_m: float,
+    ) -> Closure | None:
+        """The closure of the last keyframe of a path with older ones by a search over all poses that drift allows.
+
+        None if it fits nowhere in the older keyframes together, or at two poses.
+        T_world : (K, 3, 3) of all keyframes; near : numbers of those within reach
+        radius_m : uncertainty of the position relative to them
+        """
+        newest, size_m = path[-1], self.submaps.config.voxel_size_m * path[-1].scale
+        near_anchors = dict.fromkeys(self.submaps.anchor_of(k) for k in near.tolist())
+        placed, anchors = (
+            [replace(old[k], T_odom_lidar=T_world[k]) for k in chosen] for chosen in (near.tolist(), near_anchors)
+        )
+        surfaces = downsample(seen_together(placed, lie.identity(2)), size_m)
+        points = thinned(seen_together(path, lie.inverse(newest.T_odom_lidar)), size_m)
+        window = Window(T_world[-1], radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
+        found = find(points, SearchGrid.of_points(surfaces, size_m), window, _WANTED)
+        return self.aligned(newest, found[0].T_target_source, anchors, old) if len(found) == 1 else None
 
     def aligned(
         self, source: Keyframe, T_world_source: Pose, anchors: Sequence[Keyframe], keyframes: Sequence[Keyframe]

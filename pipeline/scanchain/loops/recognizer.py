@@ -17,7 +17,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, VoxelSubmaps, submap_around
 from scanchain.loops.verification import Verification, Verifier
 
-RECOGNIZERS = {"outline": "scanchain.loops.outline:OutlineRecognizer"}
+RECOGNIZERS = {"outline": "scanchain.loops.upright_search:OutlineRecognizer"}
 _PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
 _PLACE_SIGMAS = 3.0  # the same in standard deviations of the prediction by the graph, where these allow more
 _SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps along the path

@@ -103,8 +103,7 @@ class VoxelSubmaps:
         submap = self.cached.pop((anchor, last), None)
         if submap is None:
             chosen = self._nearest(keyframes[anchor]) if is_of_map else range(first, last + 1)
-            build = self._build_at_once if is_of_map and self.dimension == 3 else self._build
-            submap = build(keyframes[anchor], [keyframes[index] for index in chosen])
+            submap = self._build(keyframes[anchor], [keyframes[index] for index in chosen], is_of_map)
             submap.compact()
         self.cached[anchor, last] = submap
         if len(self.cached) > _MAX_CACHED:
@@ -115,19 +114,15 @@ class VoxelSubmaps:
         count = min(_OF_MAP * (2 * self.half_width + 1), self.of_map.n)
         return sorted(np.atleast_1d(self.of_map.query(anchor.T_odom_lidar[:-1, -1], count)[1]).tolist())
 
-    def _build(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
+    def _build(self, anchor: Keyframe, members: Sequence[Keyframe], is_of_map: bool) -> VoxelMap:
+        """The submap; of a 3D map, of all points together: every voxel is fitted once, and all are equally old."""
         submap = VoxelMap(self.dimension, self.config, anchor.scale, anchor.noise_m)
         T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
+        if is_of_map and self.dimension == 3:
+            submap.insert(seen_together(members[::_OF_MAP], T_anchor_odom), lie.identity(3))
+            return submap
         for keyframe in members:
             submap.insert(keyframe.points, T_anchor_odom @ keyframe.T_odom_lidar)
-        return submap
-
-    def _build_at_once(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
-        """The submap of all points together: every voxel is fitted once, and all of them are equally old."""
-        submap = VoxelMap(self.dimension, self.config, anchor.scale, anchor.noise_m)
-        T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
-        points = [lie.transform(T_anchor_odom @ each.T_odom_lidar, each.points) for each in members[::_OF_MAP]]
-        submap.insert(np.vstack(points), lie.identity(self.dimension))
         return submap
 
 

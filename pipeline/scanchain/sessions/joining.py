@@ -19,8 +19,8 @@ from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import PlaceTest, compared
-from scanchain.loops.map_search import MEMBERS, UprightMap
 from scanchain.loops.planar_map_search import PlanarMapSearch
+from scanchain.loops.upright_search import MEMBERS, UprightMap
 from scanchain.maps import Edges, SavedMap
 from scanchain.placement import loop_information
 from scanchain.sessions.alignment import align
