@@ -60,7 +60,7 @@ def judge(result: SlamResult) -> Judged:
     final, expected = final_verdicts(result.closures, result.state), expected_of(result)
     table = closures_table(final, result.keyframes, result.trajectory.dimension)
     steps = steps_table(result.steps, result.trajectory, result.T_base_lidar)
-    return judge_evidence(evidence_of(steps, table, expected and expected.ate))
+    return judge_evidence(evidence_of(steps, table, expected and expected.ate), result.T_base_lidar)
 
 
 @_freeing()
