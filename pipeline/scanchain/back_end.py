@@ -63,9 +63,9 @@ class BackEnd:
         schedule = Schedule(self.graph, config.graph, config.maps.voxel_size_m)
         self.placement = Placement(config.loops, self.closer, schedule, self.keyframes, self.first)
         if prior is not None:
-            self._begin_in(prior, prior_is_final)
+            self._add_map(prior, prior_is_final)
 
-    def _begin_in(self, prior: SavedMap, is_final: bool) -> None:
+    def _add_map(self, prior: SavedMap, is_final: bool) -> None:
         """Add the keyframes of a map as fixed nodes; the location of the next keyframe in it is unknown."""
         dimension = self.graph.dimension
         if prior.dimension != dimension:
@@ -77,7 +77,7 @@ class BackEnd:
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
         self.keyframes += prior.keyframes
         self.errors += [KeyframeErrors(1.0, self.nothing, 1.0)] * len(prior.keyframes)
-        self.start_m = self.closer.begin_in(prior.keyframes, prior.folder, is_final=is_final)
+        self.start_m = self.closer.add_map(prior.keyframes, prior.folder, is_final=is_final)
 
     def add(
         self,

@@ -12,7 +12,7 @@ from scanchain.config import LoopsConfig
 from scanchain.data import Closure, ClosureVerdict, GraphState, Keyframe, Matrix, Pose, Problem
 from scanchain.graph.factors import edge_information
 from scanchain.graph.schedule import LAG, Schedule
-from scanchain.loops import ClosureTable, LoopCloser, PlaceTest
+from scanchain.loops import ClosureTable, LoopCloser, SequentialPlaceTest
 from scanchain.loops.evidence import pose_by
 
 _TOO_FEW = Problem.plain("too few keyframes agree on the place")
@@ -51,8 +51,10 @@ class Placement:
         self.closures = ClosureTable()
         self.T_world_odom = lie.identity(self.graph.dimension)
         self.first = first
-        self.evidence = PlaceTest(closer.segments)
-        self.rival = PlaceTest(closer.segments)  # of another location in the map, while the log has no match
+        self.evidence = SequentialPlaceTest(closer.segments)
+        self.rival = SequentialPlaceTest(
+            closer.segments
+        )  # of another location in the map, while the log has no match
         self.by_map: Closure | None = None  # the closure with the map of the newest keyframe that has one
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
 
@@ -60,7 +62,7 @@ class Placement:
     def is_in_map(self) -> bool:
         """True if closures in force join the newest keyframe to the map."""
         components = self.closer.segments.components(self.graph)
-        return self.first > 0 and not self.evidence.is_gathering and bool(components[-1] == components[0])
+        return self.first > 0 and not self.evidence.is_testing and bool(components[-1] == components[0])
 
     def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
         """Join the first scan of the log to the map's nearest keyframe, by its pose and sigmas (m, rad)."""
@@ -70,19 +72,19 @@ class Placement:
         information = np.diag(lie.by_component(self.graph.freedom, *sigmas) ** -2.0)
         self._move(self.first, T_world_lidar @ lie.inverse(self.graph.poses[self.first]))
         self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
-        self.evidence.give()
+        self.evidence.accept()
         self.schedule.optimize()
         self.follow_graph()
 
     def close(self, *, is_keyframe: bool) -> tuple[Closure, ...]:
         """Closures of searches that this scan completes, and of the newest keyframe if the scan is one."""
-        if self.evidence.is_in_vain(self.keyframes[-1]):
-            self.give_up()
-        if self.rival.is_in_vain(self.keyframes[-1]) and not self.rival.is_accepted:
-            self.rival.drop(self.closer.segments.starts[-1])
-        closures = self.take(self.closer.advance())
+        if self.evidence.is_rejected(self.keyframes[-1]):
+            self.reject_location()
+        if self.rival.is_rejected(self.keyframes[-1]) and not self.rival.is_accepted:
+            self.rival.reject(self.closer.segments.starts[-1])
+        closures = self.record(self.closer.advance())
         if is_keyframe:
-            closures += self.take(self.closer.close(self.keyframes, self.graph), self._at_rival())
+            closures += self.record(self.closer.close(self.keyframes, self.graph), self._at_rival())
         for closure in closures if self.first else ():
             is_by_map = closure.verdict is ClosureVerdict.ACCEPTED and closure.target < self.first
             if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
@@ -92,7 +94,7 @@ class Placement:
                 self.T_world_odom = lie.normalize(T_world_source @ T_source_odom)
         return closures
 
-    def take(self, closures: tuple[Closure, ...], at_rival: tuple[Closure, ...] = ()) -> tuple[Closure, ...]:
+    def record(self, closures: tuple[Closure, ...], at_rival: tuple[Closure, ...] = ()) -> tuple[Closure, ...]:
         """Record closures; those accepted become edges of the graph.
 
         at_rival : tried at the other location in the map that is being tested
@@ -100,15 +102,15 @@ class Placement:
         if not closures and not at_rival:
             return ()
         closures = self._tested(closures, at_rival) if self.closer.segments.starts[-1] else closures
-        taken = tuple(
+        recorded = tuple(
             self._add(closure) if closure.verdict is ClosureVerdict.ACCEPTED else closure for closure in closures
         )
-        self.closures.extend(taken)
-        return taken
+        self.closures.extend(recorded)
+        return recorded
 
     def optimize(self, *, is_live: bool) -> GraphState | None:
         """Optimize the graph if it is due; returns its state if more than its end moved, else None."""
-        if self.evidence.is_gathering:
+        if self.evidence.is_testing:
             return None
         moved = len(self.graph) - self.schedule.advance(is_live=is_live)
         if moved:
@@ -124,19 +126,19 @@ class Placement:
 
     def start_segment(self, keyframe: int) -> None:
         """Start a segment: the motion to this keyframe, the newest, is not known."""
-        self.give_up()
-        self.rival.drop(keyframe)
+        self.reject_location()
+        self.rival.reject(keyframe)
         self.closer.start_segment(keyframe)
 
     def finish(self) -> None:
         """Record the last closures; a location still being tested has too little evidence and is rejected."""
-        self.take(self.closer.finish(self.keyframes, self.graph))
-        self.give_up()
+        self.record(self.closer.finish(self.keyframes, self.graph))
+        self.reject_location()
 
-    def give_up(self) -> None:
+    def reject_location(self) -> None:
         """Reject the location that is being tested, if any; search for that of the newest segment again."""
-        if self.evidence.is_gathering:
-            self.evidence.drop(self.closer.segments.starts[-1])
+        if self.evidence.is_testing:
+            self.evidence.reject(self.closer.segments.starts[-1])
             self.closer.segments.assume(-1)
             self.closer.search_again()
 
@@ -148,8 +150,8 @@ class Placement:
             placed = range(*segments.span(start, len(graph)))
             is_joined = ((targets < start) & (sources >= start) & (sources < placed.stop)).any()
             world, of_same_log = (self.keyframes, graph.poses), start > self.first
-            if is_joined and not self.evidence.holds(placed, *world, of_same_log=of_same_log):
-                self._take_back(placed, _TOO_FEW)
+            if is_joined and not self.evidence.passes_at(placed, *world, of_same_log=of_same_log):
+                self._reject_joins(placed, _TOO_FEW)
                 is_any = True
         return is_any
 
@@ -161,33 +163,33 @@ class Placement:
     def _tested(self, closures: tuple[Closure, ...], at_rival: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Closures; those that would join the newest segment to older ones are rejected until the test accepts."""
         start, evidence, world = self.closer.segments.starts[-1], self.evidence, (self.keyframes, self.graph.poses)
-        closures, found = self._told_apart(closures)
+        closures, found = self._split_elsewhere(closures)
         elsewhere = found + at_rival
-        if elsewhere and not evidence.is_gathering:
-            self.rival.note(elsewhere)
-            if replacing := self.rival.collect(elsewhere, *world, least_matches=evidence.matches):
+        if elsewhere and not evidence.is_testing:
+            self.rival.record(elsewhere)
+            if replacing := self.rival.update(elsewhere, *world, least_matches=evidence.matches):
                 return (*self._withdrawn(closures, _REPLACED), *replacing)
         older = [each for each in closures if each.target < start <= each.source]
-        evidence.note(older)
+        evidence.record(older)
         components = self.closer.segments.components(self.graph, with_assumed=False)
         is_joined = (components == components[-1]).tolist()
         known = [each for each in older if is_joined[each.target]]
-        if known and not evidence.is_gathering and not evidence.follow(known, *world):
+        if known and not evidence.is_testing and not evidence.update_joined(known, *world):
             return self._withdrawn(closures, _CONTRADICTED)
         if any(each.verdict is ClosureVerdict.ACCEPTED for each in known):
-            self.rival.drop(start)
+            self.rival.reject(start)
         tested = [each for each in older if not is_joined[each.target]]
-        was_gathering = evidence.is_gathering
-        joining = evidence.collect(tested, *world)
-        self.closer.segments.assume(evidence.waiting[0].target if evidence.is_gathering else -1)
-        if evidence.is_gathering and not was_gathering:
+        was_testing = evidence.is_testing
+        joining = evidence.update(tested, *world)
+        self.closer.segments.assume(evidence.waiting[0].target if evidence.is_testing else -1)
+        if evidence.is_testing and not was_testing:
             self._move_to(evidence.waiting[0])
             self.follow_graph()
         alone = [each.rejected(_TOO_FEW) if each.verdict is ClosureVerdict.ACCEPTED else each for each in tested]
         others = [each for each in closures if each.source < start or is_joined[each.target]]
         return (*others, *(each.rejected(_ELSEWHERE) for each in found), *(joining or alone))
 
-    def _told_apart(self, closures: tuple[Closure, ...]) -> tuple[tuple[Closure, ...], tuple[Closure, ...]]:
+    def _split_elsewhere(self, closures: tuple[Closure, ...]) -> tuple[tuple[Closure, ...], tuple[Closure, ...]]:
         """Closures in two groups: others, and those far from the log's location in the map, if it has no match."""
         if not self.first or self.closer.is_tracking(self.keyframes):
             return closures, ()
@@ -206,7 +208,7 @@ class Placement:
 
     def _at_rival(self) -> tuple[Closure, ...]:
         """The closure of the newest keyframe at the other location that is being tested, if any."""
-        if not self.rival.is_gathering:
+        if not self.rival.is_testing:
             return ()
         T_world = pose_by(self.rival.waiting[-1], self.keyframes[-1].index, self.keyframes, self.graph.poses)
         return self.closer.near.in_map_at(T_world, self.keyframes)
@@ -214,17 +216,17 @@ class Placement:
     def _withdrawn(self, closures: tuple[Closure, ...], problem: Problem) -> tuple[Closure, ...]:
         """Withdraw all closures that joined the newest segment to older ones; search for its location again."""
         start = self.closer.segments.starts[-1]
-        is_taken_back = self._take_back(range(start, len(self.keyframes)), problem)
-        self.evidence.drop(start)
+        is_withdrawn = self._reject_joins(range(start, len(self.keyframes)), problem)
+        self.evidence.reject(start)
         if problem is _REPLACED:
-            self.evidence.replace_by(self.rival)
-        self.rival.drop(start)
+            self.evidence.continue_from(self.rival)
+        self.rival.reject(start)
         self.closer.search_again()
         self.schedule.stop()
         self.by_map, self.joined_start = None, 0
-        return tuple(each.rejected(problem) if is_taken_back(each) else each for each in closures)
+        return tuple(each.rejected(problem) if is_withdrawn(each) else each for each in closures)
 
-    def _take_back(self, segment: range, problem: Problem) -> Callable[[Closure], bool]:
+    def _reject_joins(self, segment: range, problem: Problem) -> Callable[[Closure], bool]:
         """Reject the closures that join the keyframes of a segment to older ones; returns the test for these."""
 
         def is_meant(closure: Closure) -> bool:

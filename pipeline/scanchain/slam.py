@@ -56,7 +56,7 @@ class SlamResult:
     without a map, and if no keyframe was evidence for a location in it.
     ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
     suffice or there is none.
-    ``map_alike_share`` is the share of the searches of the map that found several similar locations.
+    ``map_ambiguous_share`` is the share of the searches of the map that found several similar locations.
     ``noise`` is that of the ranges, measured on the first scans; ``steps`` has the figures of all scans.
     ``components`` (K,) labels each keyframe's submap; no loop joins different submaps; usually there is one.
     """
@@ -80,7 +80,7 @@ class SlamResult:
     calibrated_from: int = 0
     map_log_odds: float = math.nan
     map_rival_log_odds: float = math.nan
-    map_alike_share: float = 0.0
+    map_ambiguous_share: float = 0.0
     noise: RangeNoise = field(default_factory=RangeNoise)
 
     @property
@@ -221,7 +221,7 @@ class Slam:
             calibrated_from=tracking.calibrated_from,
             map_log_odds=placement.evidence.best if first else math.nan,
             map_rival_log_odds=placement.rival.log_odds if placement.rival.is_accepted else math.nan,
-            map_alike_share=back_end.closer.alike_share,
+            map_ambiguous_share=back_end.closer.ambiguous_share,
             noise=tracking.resolution.noise,
         )
 

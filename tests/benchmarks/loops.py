@@ -66,7 +66,7 @@ def row(path: Path, drift: tuple[float, float], truth: Trajectory, false_share: 
     loops_s = sum(step.timing.loops_s for step in map(slam.process, log.scans()))
     spent_s = perf_counter() - started
     if false_share:
-        slam.back_end.placement.take(false_closures(slam, false_share))
+        slam.back_end.placement.record(false_closures(slam, false_share))
     result = slam.finish()
     everything = final_verdicts(result.closures, result.state)
     is_made_up = [tried.reason == MADE_UP for tried in result.closures]

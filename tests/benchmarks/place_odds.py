@@ -42,7 +42,7 @@ class Shown:
     def __init__(self, saved: SavedMap) -> None:
         self.config = load_settings(2).config
         self.saved, self.closer = saved, LoopCloser(self.config, 2)
-        self.closer.begin_in(list(saved.keyframes))
+        self.closer.add_map(list(saved.keyframes))
 
     def of(self, keyframe: Keyframe, T_map_lidar: Pose) -> tuple[float, float, float] | None:
         """None where the map has nothing near."""

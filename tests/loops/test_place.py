@@ -172,7 +172,7 @@ def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
 def test_a_submap_of_a_map_takes_no_more_memory_than_its_voxels():
     keyframes = passage(street())
     submaps = VoxelSubmaps(3, 5, configured(3).local_map, Segments())
-    submaps.begin_in(keyframes)
+    submaps.add_map(keyframes)
     submap = submaps.around(5, keyframes, 10)
     assert len(submap) <= len(submap.voxels.cells) < max(2 * len(submap), 4097)
     loose = VoxelMap(3, configured(3).local_map)
@@ -242,7 +242,7 @@ def sought(mapped, log, folder):
     """Closures of each keyframe of a log in a map, and its true poses; odometry begins elsewhere."""
     first, gone_m = len(mapped), mapped[-1].traveled_m + 500.0
     closer = LoopCloser(configured(3), 3)
-    closer.begin_in(mapped, folder)
+    closer.add_map(mapped, folder)
     closer.start_segment(first)
     moved = [
         replace(k, index=first + n, T_odom_lidar=T_ODOM_WORLD @ k.T_odom_lidar, traveled_m=gone_m + k.traveled_m)
@@ -258,7 +258,7 @@ def sought(mapped, log, folder):
 def begun_live(mapped, seen, folder):
     """A live search in a map before its first keyframe, and the keyframes up to that one."""
     closer = LoopCloser(configured(3), 3, is_live=True)
-    closer.begin_in(mapped, folder)
+    closer.add_map(mapped, folder)
     closer.start_segment(len(mapped))
     T_odom_lidar = T_ODOM_WORLD @ seen.T_odom_lidar
     return closer, [*mapped, replace(seen, index=len(mapped), T_odom_lidar=T_odom_lidar, traveled_m=10_000.0)]

@@ -13,7 +13,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import _OF_FIND as FOUND
-from scanchain.loops.evidence import PlaceTest
+from scanchain.loops.evidence import SequentialPlaceTest
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.odometry import Odometry
 from scanchain.odometry.odometry import first_match
@@ -102,7 +102,7 @@ def keyframes_in(rooms, away_m=()):
 def begun():
     segments = Segments()
     segments.start(3)
-    return PlaceTest(segments), segments
+    return SequentialPlaceTest(segments), segments
 
 
 def up_to(index, keyframes):
@@ -120,13 +120,13 @@ def test_keyframes_that_fit_one_place_join_a_log_to_a_map_once_they_are_enough()
     keyframes = keyframes_in([4.0] * 8)
     evidence, segments = begun()
     graph = joined(11)
-    assert not evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes))
-    assert evidence.is_gathering and not evidence.is_accepted
-    assert not evidence.collect(tried(4, overlap=0.61), *up_to(4, keyframes))
-    assert not evidence.collect(tried(5, y_m=3.0), *up_to(5, keyframes)), "it is at another pose"
-    joining = [evidence.collect(tried(source, overlap=0.61), *up_to(source, keyframes)) for source in range(6, 9)]
+    assert not evidence.update(tried(3, overlap=0.61), *up_to(3, keyframes))
+    assert evidence.is_testing and not evidence.is_accepted
+    assert not evidence.update(tried(4, overlap=0.61), *up_to(4, keyframes))
+    assert not evidence.update(tried(5, y_m=3.0), *up_to(5, keyframes)), "it is at another pose"
+    joining = [evidence.update(tried(source, overlap=0.61), *up_to(source, keyframes)) for source in range(6, 9)]
     assert [[each.source for each in closures] for closures in joining] == [[], [], [3, 4, 6, 7, 8]]
-    assert not evidence.is_gathering and evidence.bound == pytest.approx(np.log(1e3))
+    assert not evidence.is_testing and evidence.bound == pytest.approx(np.log(1e3))
     assert connected(segments, graph).tolist() == [False] * 3 + [True] * 8
 
 
@@ -134,10 +134,10 @@ def test_a_place_that_was_seen_through_is_dropped_however_well_the_scans_fit():
     keyframes = keyframes_in([9.0] * 8)
     evidence, _ = begun()
     for source in range(3, 9):
-        assert not evidence.collect(tried(source), *up_to(source, keyframes))
-    assert evidence.is_in_vain(keyframes[-1])
-    evidence.drop(3)
-    assert not evidence.is_gathering and np.isnan(evidence.best)
+        assert not evidence.update(tried(source), *up_to(source, keyframes))
+    assert evidence.is_rejected(keyframes[-1])
+    evidence.reject(3)
+    assert not evidence.is_testing and np.isnan(evidence.best)
 
 
 def test_keyframes_closer_than_a_meter_count_for_the_path_between_them():
@@ -146,8 +146,8 @@ def test_keyframes_closer_than_a_meter_count_for_the_path_between_them():
     odds = []
     for keyframes in (apart, close):
         evidence, _ = begun()
-        evidence.collect(tried(3), *up_to(3, keyframes))
-        evidence.collect(tried(4), *up_to(4, keyframes))
+        evidence.update(tried(3), *up_to(3, keyframes))
+        evidence.update(tried(4), *up_to(4, keyframes))
         odds.append(evidence.log_odds)
     assert [each - FOUND[2] for each in odds] == pytest.approx([4.0, 2.5])
 
@@ -155,12 +155,12 @@ def test_keyframes_closer_than_a_meter_count_for_the_path_between_them():
 def test_the_longer_the_path_that_was_sought_the_more_a_place_has_to_show():
     keyframes = [replace(each, traveled_m=20.0 * each.index) for each in keyframes_in([4.0] * 8)]
     evidence, _ = begun()
-    evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes))
+    evidence.update(tried(3, overlap=0.61), *up_to(3, keyframes))
     assert evidence.bound == pytest.approx(np.log(1e3))
     log_odds = evidence.log_odds
-    evidence.drop(3)
+    evidence.reject(3)
     assert evidence.best == log_odds, "that was cut short, and so is not certain"
-    evidence.collect(tried(7, overlap=0.61), *up_to(7, keyframes))
+    evidence.update(tried(7, overlap=0.61), *up_to(7, keyframes))
     assert evidence.bound == pytest.approx(np.log(1e3 * 80.0 / 8.0))
 
 
@@ -168,61 +168,61 @@ def test_what_is_joined_is_withdrawn_once_the_place_is_seen_through_and_not_befo
     keyframes = keyframes_in([4.0] * 6 + [9.0] * 12)
     evidence, _ = begun()
     for source in range(3, 7):
-        evidence.collect(tried(source), *up_to(source, keyframes))
-    assert not evidence.is_gathering
-    holds = [evidence.follow(tried(source), *up_to(source, keyframes)) for source in range(9, 21)]
+        evidence.update(tried(source), *up_to(source, keyframes))
+    assert not evidence.is_testing
+    holds = [evidence.update_joined(tried(source), *up_to(source, keyframes)) for source in range(9, 21)]
     assert holds[0] and holds[3] and not holds[-1]
 
 
 def test_another_pose_is_taken_once_more_keyframes_match_there_than_at_the_first():
     keyframes = keyframes_in([4.0] * 20)
     evidence, rival = begun()[0], begun()[0]
-    evidence.collect(tried(3, 4, 5), *up_to(5, keyframes))
-    evidence.follow(tried(6, 7, 8, 9, 10), *up_to(10, keyframes))
+    evidence.update(tried(3, 4, 5), *up_to(5, keyframes))
+    evidence.update_joined(tried(6, 7, 8, 9, 10), *up_to(10, keyframes))
     assert evidence.matches == 8.0
     joining = [
-        rival.collect(tried(source), *up_to(source, keyframes), least_matches=evidence.matches)
+        rival.update(tried(source), *up_to(source, keyframes), least_matches=evidence.matches)
         for source in range(11, 20)
     ]
     assert not any(joining[:5]) and any(joining), "it needs about as many keyframes as the first had"
-    evidence.drop(3)
+    evidence.reject(3)
     assert evidence.matches == 0.0
-    evidence.replace_by(rival)
-    assert evidence.matches == rival.matches and not evidence.is_gathering
+    evidence.continue_from(rival)
+    assert evidence.matches == rival.matches and not evidence.is_testing
 
 
 def test_a_place_that_was_given_is_believed_until_it_is_seen_through():
     keyframes = keyframes_in([4.0] * 2 + [9.0] * 12)
     evidence, _ = begun()
-    evidence.give()
-    assert evidence.holds(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)), "nothing was tried"
-    holds = [evidence.follow(tried(source), *up_to(source, keyframes)) for source in range(3, 17)]
+    evidence.accept()
+    assert evidence.passes_at(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)), "nothing was tried"
+    holds = [evidence.update_joined(tried(source), *up_to(source, keyframes)) for source in range(3, 17)]
     assert all(holds[:6]) and not holds[-1]
-    evidence.note(tried(*range(3, 17)))
-    assert not evidence.holds(range(3, len(keyframes)), *up_to(len(keyframes), keyframes))
+    evidence.record(tried(*range(3, 17)))
+    assert not evidence.passes_at(range(3, len(keyframes)), *up_to(len(keyframes), keyframes))
 
 
 def test_places_proposed_elsewhere_say_nothing_about_a_place_that_is_joined():
     keyframes = keyframes_in([4.0] * 6)
     evidence, _ = begun()
     for source in range(3, 7):
-        evidence.collect(tried(source), *up_to(source, keyframes))
+        evidence.update(tried(source), *up_to(source, keyframes))
     before = evidence.log_odds
     elsewhere = [
         replace(each, proposed_by=Proposal.PLACE)
         for each in tried(8, y_m=9.0, overlap=0.1, verdict=ClosureVerdict.REJECTED)
     ]
-    assert evidence.follow(elsewhere, *up_to(8, keyframes)) and evidence.log_odds == before
+    assert evidence.update_joined(elsewhere, *up_to(8, keyframes)) and evidence.log_odds == before
 
 
 @pytest.mark.parametrize(("away_m", "holds"), [(0.0, False), (30.0, True)])
 def test_what_does_not_match_counts_against_a_log_only_where_the_map_shows_it(away_m, holds):
     keyframes = keyframes_in([4.0] * 6 + [9.0] * 20, [0.0] * 6 + [away_m] * 20)
     evidence, _ = begun()
-    evidence.note(tried(*range(3, 9)))
+    evidence.record(tried(*range(3, 9)))
     at_wrong = tried(*range(9, 29), overlap=0.2, verdict=ClosureVerdict.REJECTED)
-    evidence.note(at_wrong)
-    assert evidence.holds(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)) is holds
+    evidence.record(at_wrong)
+    assert evidence.passes_at(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)) is holds
     assert np.isfinite(evidence.best) is np.bool_(holds)
 
 

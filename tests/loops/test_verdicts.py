@@ -48,7 +48,7 @@ def undisturbed(log):
 @pytest.fixture(scope="module")
 def disturbed(log):
     slam = driven(log)
-    slam.back_end.placement.take(false_closures(slam, 0.3))
+    slam.back_end.placement.record(false_closures(slam, 0.3))
     return slam.finish()
 
 
@@ -110,7 +110,7 @@ def forced(log, tmp_path_factory):
     finish = Slam.finish
 
     def finish_forced(slam, progress):
-        slam.back_end.placement.take(false_closures(slam, 0.3))
+        slam.back_end.placement.record(false_closures(slam, 0.3))
         return finish(slam, progress)
 
     out = tmp_path_factory.mktemp("forced") / "run"

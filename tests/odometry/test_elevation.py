@@ -97,7 +97,7 @@ def calibrated(poses, offset_deg, rng, *, is_wanted=True, points=3000):
     calibration, rebuilt = ElevationCalibration(is_wanted=is_wanted), 0
     for T in poses:
         cloud = raised(seen(T, rng, points), -math.radians(offset_deg))
-        rebuilt += bool(calibration.take(raised(cloud, calibration.offset_rad), T))
+        rebuilt += bool(calibration.update(raised(cloud, calibration.offset_rad), T))
     return calibration, rebuilt
 
 

@@ -72,7 +72,7 @@ def test_weak_matches_show_no_standstill():
     for match in matches(0.06 * np.arange(1, 30)):
         weak = replace(match, information=1e-6 * match.information)
         assert not standstill.confirms(weak)
-        standstill.follow(weak)
+        standstill.update(weak)
 
 
 @pytest.mark.parametrize(("world", "seed"), [("town", 1), ("town", 4), ("forest", 3)])
@@ -104,7 +104,7 @@ def test_matches_that_all_lie_beside_the_first_scan_do_not_move_it():
 def test_wheels_that_come_in_while_the_lidar_stands_end_the_hold():
     standstill = Standstill(3)
     held(standstill, np.zeros(20))
-    standstill.leave()
+    standstill.end()
     assert not standstill.is_standing
 
 

@@ -121,7 +121,7 @@ def test_an_estimator_says_what_it_knows_and_goes_without_scans_whose_pose_is_op
     for n, (T_odom_lidar, T_odom_base) in enumerate(zip(lidar, wheels, strict=True)):
         is_open = n in (0, 50)
         wrong = T_odom_lidar @ lie.pose_2d(5.0, 0.0, 1.0)
-        estimator.take(wrong if is_open else T_odom_lidar, T_odom_base, is_open=is_open)
+        estimator.update(wrong if is_open else T_odom_lidar, T_odom_base, is_open=is_open)
         assert n > 60 or estimator.is_usable == (is_open or estimator.found is not None)
     assert estimator.is_usable
     note = estimator.finish()

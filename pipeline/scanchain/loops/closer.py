@@ -52,7 +52,7 @@ class LoopCloser:
         self.search: PlaceSearch[Any] = PlaceSearch(finder, self.segments)
         self.places = PlaceCloser(config, dimension, submaps, verifier)
 
-    def begin_in(
+    def add_map(
         self, keyframes: Sequence[Keyframe], folder: Path | None = None, *, is_final: bool = True
     ) -> float:
         """Add the keyframes of a map, to which loops close first; returns the start of the log's path, in meters.
@@ -62,16 +62,16 @@ class LoopCloser:
         """
         self.near.of_map = len(keyframes)
         if is_final:
-            self.near.submaps.begin_in(keyframes)
+            self.near.submaps.add_map(keyframes)
         if self.config.loops.enabled:
-            self.search.begin_in(keyframes, folder)
-        return self.places.begin_in(keyframes, are_added=self.near.finder is not None)
+            self.search.add_map(keyframes, folder)
+        return self.places.add_map(keyframes, are_added=self.near.finder is not None)
 
     @property
-    def alike_share(self) -> float:
+    def ambiguous_share(self) -> float:
         """Share of the searches of a map, or of older segments, whose result was ambiguous."""
         finder = self.search.finder
-        return finder.alike / max(finder.searches, 1)
+        return finder.ambiguous / max(finder.searches, 1)
 
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
@@ -103,7 +103,7 @@ class LoopCloser:
         components = self.segments.components(graph)
         connected = components == components[-1]
         closures = self.near.close(keyframes, graph, connected)
-        self.search.take(keyframes, closures)
+        self.search.record(keyframes, closures)
         if self.near.finder is None and self.is_tracking(keyframes):
             self.search.skip()
             self.places.skip(keyframes)

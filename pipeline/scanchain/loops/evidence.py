@@ -69,7 +69,7 @@ def is_in_sight(keyframe: Keyframe, others: Sequence[Keyframe]) -> bool:
     return bool(seen >= _IN_SIGHT * max(len(keyframe.points), 1))
 
 
-class PlaceTest:
+class SequentialPlaceTest:
     """Sequential test (Wald 1945) of the assumed pose of the newest segment of a log among older keyframes.
 
     The older keyframes are those of a map or of earlier segments. Each keyframe that was matched with them adds
@@ -93,21 +93,21 @@ class PlaceTest:
         self.tried: dict[int, Closure] = {}  # of each keyframe, the best closure at its pose there
 
     @property
-    def is_gathering(self) -> bool:
+    def is_testing(self) -> bool:
         """True while a pose is being tested."""
         return bool(self.waiting)
 
     @property
     def is_accepted(self) -> bool:
         """True if the log-odds of the pose that is being tested are above the acceptance threshold."""
-        return self.is_gathering and self.log_odds >= self.bound
+        return self.is_testing and self.log_odds >= self.bound
 
     @property
     def bound(self) -> float:
         """Log-odds above which a pose is accepted; the longer the path that was searched for, the higher."""
         return math.log(max(self.searches, 1.0) / _RISK)
 
-    def collect(
+    def update(
         self,
         closures: Sequence[Closure],
         keyframes: Sequence[Keyframe],
@@ -119,7 +119,7 @@ class PlaceTest:
 
         least_matches : number of matches that it must exceed: that of the pose that it would replace
         """
-        if not self.is_gathering:
+        if not self.is_testing:
             if all(each.verdict is ClosureVerdict.REJECTED for each in closures):
                 return ()
             newest, start = keyframes[-1], keyframes[self.segments.starts[-1]]
@@ -139,17 +139,17 @@ class PlaceTest:
         joining, self.waiting = tuple(self.waiting), []
         return joining
 
-    def give(self) -> None:
+    def accept(self) -> None:
         """Accept a given pose of the first scan in the map, until observations contradict it."""
         self.is_given, self.log_odds = True, self.bound + _RESERVE
 
-    def replace_by(self, other: PlaceTest) -> None:
+    def continue_from(self, other: SequentialPlaceTest) -> None:
         """Continue with the pose that another test accepted, in place of the one that was withdrawn."""
         self.log_odds, self.matches, self.searches = other.log_odds, other.matches, other.searches
         self.matched_m, self.counted_m = other.matched_m, other.counted_m
         self.tried |= other.tried
 
-    def follow(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
+    def update_joined(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
         """Add closures of a segment that is joined to older ones; returns False once its pose is rejected.
 
         Far from the last match nothing counts: odometry may have drifted away from the location.
@@ -162,25 +162,25 @@ class PlaceTest:
         self.log_odds = min(self.log_odds, self.bound + _RESERVE)
         return self.log_odds > _REJECTED
 
-    def note(self, closures: Sequence[Closure]) -> None:
+    def record(self, closures: Sequence[Closure]) -> None:
         """Record closures that were tried at the current pose of their keyframes."""
         for each in filter(_is_there, closures):
             known = self.tried.get(each.source)
             if known is None or rank_of(each) > rank_of(known):
                 self.tried[each.source] = each
 
-    def is_in_vain(self, newest: Keyframe) -> bool:
+    def is_rejected(self, newest: Keyframe) -> bool:
         """True if the pose that is being tested is to be rejected, or nothing has matched there for a while."""
         since_m = newest.traveled_m - self.matched_m
-        return self.is_gathering and (self.log_odds <= _REJECTED or since_m > _TRACKED_M * newest.scale)
+        return self.is_testing and (self.log_odds <= _REJECTED or since_m > _TRACKED_M * newest.scale)
 
-    def drop(self, start: int) -> None:
+    def reject(self, start: int) -> None:
         """Reject the pose of the newest segment, which begins at ``start``, and forget what was tried there."""
         self._remember()
         self.tried = {source: each for source, each in self.tried.items() if source < start}
         self.is_given, self.log_odds, self.matches, self.waiting = False, 0.0, 0.0, []
 
-    def holds(
+    def passes_at(
         self, placed: range, keyframes: Sequence[Keyframe], T_world: Matrix, *, of_same_log: bool = False
     ) -> bool:
         """True if some keyframes, given by their numbers, pass the test at their final poses.

@@ -29,7 +29,7 @@ class Finder(Protocol[Map]):
 
     first_m, least_m, most_m : path of a segment before its first search, and least and largest between two
     match_m : path between two matches with a map that a log is tracked in, at full scale
-    searches, alike : numbers of searches so far, and of those whose result was ambiguous
+    searches, ambiguous : numbers of searches so far, and of those whose result was ambiguous
     """
 
     first_m: float
@@ -37,7 +37,7 @@ class Finder(Protocol[Map]):
     most_m: float
     match_m: float
     searches: int
-    alike: int
+    ambiguous: int
 
     def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> Map:
         """Preprocess older keyframes, whose ``T_odom_lidar`` is T_world_lidar; a map's folder may cache it."""
@@ -67,7 +67,7 @@ class PlaceSearch(Generic[Map]):
         self.underway: Underway | None = None
         self.drawn: dict[bool, tuple[Matrix, Map]] = {}  # poses, preprocessed: of the map, of the last others
 
-    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None) -> None:
+    def add_map(self, keyframes: Sequence[Keyframe], folder: Path | None) -> None:
         """Add the keyframes of a map, and preprocess them before the first search."""
         self.of_map = len(keyframes)
         T_world = np.array([each.T_odom_lidar for each in keyframes])
@@ -85,7 +85,7 @@ class PlaceSearch(Generic[Map]):
         """True while the last match with the map is recent."""
         return self._since_m(keyframes) <= _TRACKED_M
 
-    def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
+    def record(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
         """Record whether the newest keyframe, which has these closures, matches the map."""
         accepted = (each for each in closures if each.verdict is ClosureVerdict.ACCEPTED)
         if any(each.target < self.of_map for each in accepted):

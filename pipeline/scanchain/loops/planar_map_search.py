@@ -140,7 +140,7 @@ class PlanarFinder:
         self.submaps = submaps
         self.verifier = verifier
         self.ambiguous_m = -math.inf  # path up to the last ambiguous search
-        self.searches = self.alike = 0
+        self.searches = self.ambiguous = 0
 
     def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> PlanarMapSearch:
         """Surfaces and free space of keyframes."""
@@ -155,7 +155,7 @@ class PlanarFinder:
         self.searches += 1
         if best is not None and best.is_likely and best.is_ambiguous:
             self.ambiguous_m = newest_m
-            self.alike += 1
+            self.ambiguous += 1
         if best is None or not best.is_certain or newest_m - self.ambiguous_m < _CLEAR_M:
             return ()
         anchors = [each for each in target.keyframes if each.index % self.submaps.half_width == 0]

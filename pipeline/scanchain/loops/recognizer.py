@@ -116,7 +116,7 @@ class PlaceCloser:
         self.next_m = 0.0
         self.last: Closure | None = None
 
-    def begin_in(self, keyframes: Sequence[Keyframe], *, are_added: bool = True) -> float:
+    def add_map(self, keyframes: Sequence[Keyframe], *, are_added: bool = True) -> float:
         """Start after the keyframes of a map; returns the path, in meters, beyond which all are candidates.
 
         are_added : whether the submaps of the map are added to the recognizer

@@ -85,7 +85,7 @@ class VoxelSubmaps:
         self.of_map = KDTree(np.empty((0, dimension)))
         self.cached: OrderedDict[tuple[int, int], VoxelMap] = OrderedDict()
 
-    def begin_in(self, keyframes: Sequence[Keyframe]) -> None:
+    def add_map(self, keyframes: Sequence[Keyframe]) -> None:
         """Add the keyframes of a map."""
         self.of_map = KDTree(np.array([keyframe.T_odom_lidar[:-1, -1] for keyframe in keyframes]))
 

@@ -277,7 +277,7 @@ class UprightFinder:
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.searches = self.alike = 0
+        self.searches = self.ambiguous = 0
 
     def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> UprightMap:
         """The upright structure of keyframes."""
@@ -287,7 +287,7 @@ class UprightFinder:
         """The closure of the newest keyframe with the older ones, verified or not; see ``Finder``."""
         closure = yield from target.found(keyframes[max(start, len(keyframes) - MEMBERS) :])
         self.searches += 1
-        self.alike += closure is not None and closure.cause == _AMBIGUOUS.cause
+        self.ambiguous += closure is not None and closure.cause == _AMBIGUOUS.cause
         return () if closure is None else (closure,)
 
 

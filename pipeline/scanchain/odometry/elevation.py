@@ -54,13 +54,13 @@ class ElevationCalibration:
         self.scale = 1.0
         self.windows = 0
         self.estimates: list[tuple[float, float]] = []  # offset and σ of each window
-        self.forget()
+        self.reset()
 
     def corrected(self, sweep: Sweep) -> Sweep:
         """The sweep with its points raised by the offset."""
         return replace(sweep, points=raised(sweep.points, self.offset_rad)) if self.offset_rad else sweep
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Discard the collected scans: the next pose is not connected to theirs."""
         self.T_odom_last: Pose | None = None
         self.left_out = 0
@@ -68,7 +68,7 @@ class ElevationCalibration:
         self.adjusting: Adjusting | None = None  # of the collected scans, one step per scan
         self.since: list[tuple[Points, Pose]] = []  # the scans since they were collected
 
-    def take(self, points: Points, T_odom_lidar: Pose) -> list[tuple[Points, Pose]]:
+    def update(self, points: Points, T_odom_lidar: Pose) -> list[tuple[Points, Pose]]:
         """Add a scan; returns corrected scans where a window changed the offset significantly, else none.
 
         These are the window's scans with their adjusted poses, the last one unchanged, and the scans since.

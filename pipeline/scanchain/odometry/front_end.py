@@ -70,7 +70,7 @@ class FrontEnd:
         self.lost += tracked.state is State.LOST
         if not tracked.is_repeated:
             self.information = self._since(tracked)
-            self.error_tracker.take(tracked)
+            self.error_tracker.update(tracked)
         information = self.nothing
         if is_keyframe:
             information = self._of_edge(tracked)
@@ -156,7 +156,7 @@ class KeyframeErrorTracker:
         self.scans = 0  # number of scans in the mean
         self.is_open = False  # whether a pose since the last keyframe was undetermined or lost
 
-    def take(self, tracked: Tracked) -> None:
+    def update(self, tracked: Tracked) -> None:
         """Add a scan. One whose pose is undetermined or contradicted is left out of the mean."""
         match = tracked.match
         if match.observability < 1.0 or tracked.state is State.LOST:

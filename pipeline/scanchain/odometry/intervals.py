@@ -41,7 +41,7 @@ class Intervals:
         self.usual_s = 0.0
         self.recent_s: deque[float] = deque(maxlen=_RECENT)
 
-    def take(self, scan: Scan, interval_s: float) -> None:
+    def update(self, scan: Scan, interval_s: float) -> None:
         """Add a scan and the interval since the last one.
 
         The usual interval is a running mean that leaves out gaps. Where it is far from the median of the last

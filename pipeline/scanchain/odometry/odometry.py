@@ -178,7 +178,7 @@ class Odometry:
         )
         tracked = self._at_stamp(tracked, sweep, prediction)
         is_open = tracked.state is not State.OK
-        self.predictor.wheels.mounting.take(tracked.T_odom_lidar, tracked.scan.T_odom_base, is_open=is_open)
+        self.predictor.wheels.mounting.update(tracked.T_odom_lidar, tracked.scan.T_odom_base, is_open=is_open)
         return tracked
 
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:
@@ -230,9 +230,9 @@ class Odometry:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
         if not may_stand:
-            self.standstill.leave()
+            self.standstill.end()
         elif state is not State.LOST:
-            self.standstill.follow(match)
+            self.standstill.update(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
             may_be = f"may be {prediction.reach_m:.0f} m away after a time without scans"
             return self._reset_map(points, prediction, may_be)
@@ -260,8 +260,8 @@ class Odometry:
     def _reset_map(self, points: Points, prediction: Prediction, why: str) -> _Registered:
         """Clear the map, which the scan does not fit; a new one begins at the pose of the last scan."""
         self.map.replace([])
-        self.recovery.forget()
-        self.elevation.forget()
+        self.recovery.reset()
+        self.elevation.reset()
         self.standstill.begin(prediction.T_odom_last)
         reason = f"{why}: {NEW_MAP}"
         match = first_match(prediction.T_odom_last, points, self.config.matching)
@@ -276,7 +276,7 @@ class Odometry:
 
     def _extend(self, points: Points, registered: _Registered) -> None:
         """Insert a scan whose pose is known, or, after many lost scans, one at its predicted pose."""
-        if self.recovery.gives_up(registered.state):
+        if self.recovery.needs_extension(registered.state):
             self.map.insert(points, self.predictor.T_odom_lidar)
         if registered.state is State.LOST:
             return
@@ -286,10 +286,10 @@ class Odometry:
     def _calibrate(self, points: Points, state: State) -> None:
         """Add the scan to the elevation calibration; rebuild the map where the offset changes."""
         if state is State.LOST:
-            self.elevation.forget()
+            self.elevation.reset()
         if state is State.LOST or not self.predictor.velocity.any():  # the first scan cannot be deskewed
             return
-        corrected = self.elevation.take(points, self.predictor.T_odom_lidar)
+        corrected = self.elevation.update(points, self.predictor.T_odom_lidar)
         if corrected:
             self.calibrated_from = self.calibrated_from or self.scans
             self.map.replace(corrected)

@@ -237,7 +237,7 @@ class Predictor:
         is_known = not (prediction.is_guess or prediction.is_second)
         if is_known and largest_magnitude(T_odom_lidar - prediction.T_odom_lidar) > _JUMP:
             self.doubtful = 1.0
-        self.intervals.take(scan, prediction.interval_s)
+        self.intervals.update(scan, prediction.interval_s)
         self.wheels.advance(scan)
         self.T_odom_lidar = T_odom_lidar
 

@@ -80,14 +80,14 @@ class Recovery:
         """
         return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, self.rough_cost)
 
-    def gives_up(self, state: State) -> bool:
+    def needs_extension(self, state: State) -> bool:
         """Update the count of lost scans; True if the map has to be extended at the predicted pose."""
         is_lost = state is State.LOST
         self.lost_scans = self.lost_scans + 1 if is_lost else 0
         self.wide_scans = _WIDE_SCANS if is_lost else max(self.wide_scans - 1, 0)
         return self.lost_scans >= _PATIENCE
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Reset the running mean of the cost, for a new map."""
         self.usual_cost = 0.0
 

@@ -82,7 +82,7 @@ class Standstill:
             self._hold(self.held, np.zeros(len(self.bias)))
         return True
 
-    def follow(self, match: Match) -> None:
+    def update(self, match: Match) -> None:
         """Add a match that does not confirm the standstill: to matches that agree elsewhere, or as their first."""
         sigma = np.sqrt(_variances(match))
         if self.held is not None:
@@ -100,7 +100,7 @@ class Standstill:
             self._hold(self.elsewhere, sigma)
         self.elsewhere = None
 
-    def leave(self) -> None:
+    def end(self) -> None:
         """End the standstill: another sensor measures the motion."""
         self.held, self.is_beginning = None, False
 

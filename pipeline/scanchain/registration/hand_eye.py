@@ -124,7 +124,7 @@ class MountingEstimator:
         self.found: HandEye | None = None
         self.is_usable = is_stated  # whether wheel odometry is usable for the next scan
 
-    def take(self, T_odom_lidar: Pose, T_odom_base: Pose | None, *, is_open: bool) -> None:
+    def update(self, T_odom_lidar: Pose, T_odom_base: Pose | None, *, is_open: bool) -> None:
         """Add the poses of a scan; ``is_open`` if that of the lidar is undetermined."""
         if self.is_stated:
             return

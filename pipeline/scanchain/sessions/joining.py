@@ -18,7 +18,7 @@ from scanchain.data import Closure, Keyframe, Matrix, Pose
 from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import PlaceTest, compared
+from scanchain.loops.evidence import SequentialPlaceTest, compared
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.loops.upright_search import MEMBERS, UprightMap
 from scanchain.maps import Edges, SavedMap
@@ -267,9 +267,9 @@ def doubt_about(joined: Joined, old: int, config: Config) -> str:
     """
     in_force, guest, segments = _joining(joined, old), joined.keyframes[old:], Segments()
     segments.start(old)
-    evidence = PlaceTest(segments)
-    evidence.note([closure for closure in joined.closures if closure.source >= old])
-    evidence.holds(range(old, len(joined.keyframes)), joined.keyframes, joined.poses)
+    evidence = SequentialPlaceTest(segments)
+    evidence.record([closure for closure in joined.closures if closure.source >= old])
+    evidence.passes_at(range(old, len(joined.keyframes)), joined.keyframes, joined.poses)
     asked = evidence.bound + (_STORIES if joined.dimension == 3 else 0.0)
     if evidence.log_odds < asked:
         agree = f"{counted(len(in_force), 'keyframe')} of it agree"

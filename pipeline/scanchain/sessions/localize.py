@@ -289,7 +289,7 @@ def _verdict(
         elif known := scans - states[MapState.SEARCHING]:
             had = f"{counted(known, 'scan')} had a location in {prior.name} that was withdrawn"
             reason = f"not certain: of {tried}, {had}"
-        elif found.result.map_alike_share >= _AMBIGUOUS_SHARE:
+        elif found.result.map_ambiguous_share >= _AMBIGUOUS_SHARE:
             reason = f"not certain: {tried} fit several locations in {prior.name} equally well"
         else:
             reason = f"not from this place: nothing in {tried} matches {prior.name}"
