@@ -210,20 +210,20 @@ def compare(
     repeat : runs of each method, interleaved
     Other arguments as in ``run``. Returns path and table. Raises InputError for bad input.
     """
-    from scanchain.comparison.compare import Comparison
     from scanchain.comparison.compare import compare as run_comparison
     from scanchain_viz.recording.results import present_comparison
 
-    comparison = Comparison(
-        logs=sources_of(log),
-        out=checks.path(out, "out"),
+    return run_comparison(
+        sources_of(log),
+        checks.path(out, "out"),
+        present_comparison,
+        Progress(),
         methods=(methods,) if isinstance(methods, str) else tuple(methods),
         overrides=overrides_of(overrides),
         ground_truth=_optional_path(ground_truth, "ground_truth"),
         repeat=repeat,
         force=force,
     )
-    return run_comparison(comparison, present_comparison, Progress())
 
 
 def optimize(graph: PoseGraph, **overrides: object) -> Optimization:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.baselines import BASELINES
-from scanchain.baselines.wrapped import AtStamp, finite
+from scanchain.baselines import BASELINES, AtStamp, finite
 from scanchain.data import Trajectory
 from scanchain.errors import MissingExtraError
 from scanchain.evaluation import absolute_error, pair

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from scanchain import evaluation, lie
-from scanchain.baselines.wrapped import KISS, KissIcp
+from scanchain.baselines import KISS, KissIcp
 from scanchain.data import Matrix, State, Step, Trajectory
 from scanchain.errors import MissingExtraError
 from scanchain.evaluation.consistency import error_samples

@@ -16,9 +16,9 @@ import pytest
 
 from scanchain.__main__ import main
 from scanchain.comparison import processes, worker
-from scanchain.comparison.compare import Compared, Comparison, compare
+from scanchain.comparison.compare import Compared, compare
 from scanchain.comparison.methods import OURS, default_names, resolve
-from scanchain.comparison.processes import EndReport, Outcome, Status, StoredScans, run_all, store
+from scanchain.comparison.processes import Status, StoredScans, store
 from scanchain.comparison.results import method_folder
 from scanchain.comparison.table import COLUMNS, Row, Table, markdown, read_table, text
 from scanchain.data import Trajectory
@@ -26,7 +26,6 @@ from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
-from scanchain.processes import Limits
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Provenance
 from scanchain.settings import Override, load_settings
@@ -75,8 +74,9 @@ def bad(path, *natures):
 
 def run(office, folder, *methods, progress=None, **changes):
     """The table of a comparison without report and recording."""
-    comparison = Comparison(logs=(office,), out=folder / "out", methods=methods, **changes)
-    return compare(comparison, lambda _: None, progress or Progress()).table
+    return compare(
+        (office,), folder / "out", lambda _: None, progress or Progress(), methods=methods, **changes
+    ).table
 
 
 def row(table, name):
@@ -236,21 +236,6 @@ def test_every_verdict_names_the_error_that_its_checks_resolve(good):
             assert each.vouched in text(table) and each.vouched in markdown(table)
         elif each.name not in ours:
             assert each.figures["ate_m"] < 1.05 * float(others[0])
-
-
-def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
-    ran, blank, standing = [], np.zeros(2), Trajectory([0, 1], np.tile(np.eye(3), (2, 1, 1)))
-
-    def fake(method, scans, folder, limits):
-        ran.append(folder.name)
-        report = EndReport(Status.OK, "", has_compiled=len(ran) == 1)
-        return Outcome(report, blank, standing, blank + len(ran), blank, folder)
-
-    monkeypatch.setattr("scanchain.comparison.processes._run", fake)
-    methods = resolve(("plicp",), 2, file=None)
-    outcomes = run_all(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Progress())
-    assert len(ran) == len(set(ran)) == 3
-    assert [outcome.seconds[0] for outcome in outcomes["plicp"]] == [2.0, 3.0]
 
 
 # the same scans for all

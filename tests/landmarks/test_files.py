@@ -6,8 +6,7 @@ import pytest
 from scanchain.errors import InputError
 from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.landmarks.ranges import OdometryNoise, solve_range_log
-from scanchain.landmarks.results import accuracy_lines
-from scanchain.landmarks.study import Options, study_file, study_log
+from scanchain.landmarks.study import Options, accuracy_lines, study_file, study_log
 from tests.support.scenes import shared_data
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.baselines.wrapped import Open3dPairs
+from scanchain.baselines import Open3dPairs
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log

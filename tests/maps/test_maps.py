@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie, maps
-from scanchain.baselines.wrapped import Open3dPairs
+from scanchain.baselines import Open3dPairs
 from scanchain.checks import LARGEST
 from scanchain.config import MapsConfig
 from scanchain.errors import InputError

@@ -229,18 +229,15 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
 def summary(rows: Sequence[Row]) -> str:
     """Totals, each log without a result and its reason, each log with segments to check or warnings."""
-    lines = [f"{name:<14} {text}" for name, text in totals(rows)]
-    lines += [f"{row.state:<14} {row.log}: {row.why}" for row in rows if row.state is not State.DONE]
-    lines += [
-        f"{'check':<14} {row.log}: {row.metrics.verdict_reason}"
-        for row in rows
-        if row.metrics is not None and row.metrics.verdict is Verdict.CHECK
-    ]
-    for row in rows:
-        if row.metrics is not None and row.warnings:
+    lines = totals(rows)
+    lines += [(row.state, f"{row.log}: {row.why}") for row in rows if row.state is not State.DONE]
+    results = [(row, row.metrics) for row in rows if row.metrics is not None]
+    lines += [("check", f"{row.log}: {m.verdict_reason}") for row, m in results if m.verdict is Verdict.CHECK]
+    for row, metrics in results:
+        if metrics.warnings:
             more = f" (and {row.warnings - 1:,} more)" if row.warnings > 1 else ""
-            lines.append(f"{'warned':<14} {row.log}: {row.metrics.warnings[0].replace(f'{row.log}: ', '')}{more}")
-    return "\n".join(lines) + "\n"
+            lines.append(("warned", f"{row.log}: {metrics.warnings[0].replace(f'{row.log}: ', '')}{more}"))
+    return "".join(f"{name:<14} {text}\n" for name, text in lines)
 
 
 def totals(rows: Sequence[Row]) -> list[tuple[str, str]]:

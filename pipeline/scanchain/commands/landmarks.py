@@ -101,9 +101,8 @@ def landmarks(
     from scanchain.clock import announcing_compilation
     from scanchain.commands.terminal import Terminal
     from scanchain.landmarks.files import read_landmark_data
-    from scanchain.landmarks.results import text_of, tree_of, write_estimate
     from scanchain.landmarks.solvers import parse_methods
-    from scanchain.landmarks.study import Options, study_file, study_log
+    from scanchain.landmarks.study import Options, study_file, study_log, text_of, tree_of, write_estimate
     from scanchain.runs.directory import RunDirectory
     from scanchain_viz.report.problems import write_report
 
@@ -161,7 +160,7 @@ def _noise(text: str | None) -> OdometryNoise | None:
 
 def _check_names(studies: Sequence[Study]) -> None:
     """Refuse problems whose files would overwrite each other."""
-    from scanchain.landmarks.results import file_stem
+    from scanchain.landmarks.study import file_stem
 
     stems = [file_stem(study.name) for study in studies]
     for study, stem in zip(studies, stems, strict=True):

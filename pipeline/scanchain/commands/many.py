@@ -183,22 +183,18 @@ def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --end 600
     """
     from scanchain.commands.terminal import Terminal
-    from scanchain.comparison.compare import Comparison
     from scanchain.comparison.compare import compare as run_comparison
     from scanchain.comparison.table import TABLE_FILE, text
     from scanchain_viz.recording.results import present_comparison
 
-    comparison = Comparison(
-        logs=logs,
-        out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
-        methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
-        command=tuple(sys.argv),
-        **given,
-    )
+    out = out or Path("runs") / f"compare-{logs[0].stem}"
+    names = [name.strip() for name in (methods or "").split(",") if name.strip()]
     with Terminal("scans") as terminal:
-        compared = run_comparison(comparison, present_comparison, terminal)
+        compared = run_comparison(
+            logs, out, present_comparison, terminal, methods=names, command=sys.argv, **given
+        )
     click.echo((compared.path / TABLE_FILE).read_text() if as_json else text(compared.table), nl=False)
     if not as_json:
-        click.echo(f"written {comparison.out}: report.html, compare.rrd, tables")
+        click.echo(f"written {out}: report.html, compare.rrd, tables")
     if compared.failures:
         raise ScanchainError(f"did not finish: {', '.join(compared.failures)}; see the table for the reason")

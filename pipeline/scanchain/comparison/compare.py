@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,33 +33,6 @@ _SHARED = "scans"  # in the directory until it is complete: what all methods rea
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
-    """A log and the methods to compare on it.
-
-    methods : names, empty for all that apply; matcher : another one, as in the configuration
-    config_file : sections of the configuration and one table per method; overrides : keys of the configuration,
-        for the log and all of ours
-    ground_truth : a TUM or KITTI file; None for the log's own
-    repeat : runs of every method, interleaved
-    time_s, memory_mib : limits of a run; None for the default ones
-    """
-
-    logs: tuple[Source, ...]
-    out: Path
-    methods: tuple[str, ...] = ()
-    matcher: str = ""
-    config_file: Path | None = None
-    overrides: tuple[Override, ...] = ()
-    ground_truth: Path | None = None
-    relations: Path | None = None
-    repeat: int = 1
-    time_s: float | None = None
-    memory_mib: float | None = None
-    force: bool = False
-    command: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Compared:
     """A finished comparison, failed methods included."""
 
@@ -73,28 +46,44 @@ class Compared:
         return [row.name for row in self.table.rows if row.status.is_failure]
 
 
-def compare(comparison: Comparison, present: Callable[[Path], None], progress: Progress) -> Compared:
-    """Run the comparison and write its directory; ``present`` adds report and recording to it.
+def compare(
+    logs: Sequence[Source],
+    out: Path,
+    present: Callable[[Path], None],
+    progress: Progress,
+    *,
+    methods: Sequence[str] = (),
+    matcher: str = "",
+    config_file: Path | None = None,
+    overrides: Sequence[Override] = (),
+    ground_truth: Path | None = None,
+    relations: Path | None = None,
+    repeat: int = 1,
+    time_s: float | None = None,
+    memory_mib: float | None = None,
+    force: bool = False,
+    command: Sequence[str] = (),
+) -> Compared:
+    """Run methods on a log and write the directory ``out``; ``present`` adds report and recording to it.
 
+    methods : names, empty for all that apply; matcher : another one, as in the configuration
+    config_file : sections of the configuration and one table per method; overrides : keys of the configuration,
+        for the log and all of ours
+    ground_truth : a TUM or KITTI file; None for the log's own
+    repeat : runs of every method, interleaved
+    time_s, memory_mib : limits of a run; None for the default ones
     Raises InputError for bad input before anything is run.
     """
-    directory = RunDirectory(
-        comparison.out, force=comparison.force, sources=comparison.logs, command=comparison.command
-    )
-    overrides = (*shared_settings(comparison.config_file), *comparison.overrides)
-    log = open_log(comparison.logs, load_settings(overrides=overrides).config.log)
+    directory = RunDirectory(out, force=force, sources=logs, command=command)
+    of_log = (*shared_settings(config_file), *overrides)
+    log = open_log(logs, load_settings(overrides=of_log).config.log)
     choose_point_times(log)
-    settings = load_settings(log.dimension, overrides=overrides)
-    methods = resolve(
-        comparison.methods or default_names(log.dimension),
-        log.dimension,
-        file=comparison.config_file,
-        overrides=comparison.overrides,
-        matcher=comparison.matcher,
-    )
+    settings = load_settings(log.dimension, overrides=of_log)
+    names = methods or default_names(log.dimension)
+    chosen = resolve(names, log.dimension, file=config_file, overrides=overrides, matcher=matcher)
     with directory:
-        directory.begin(", ".join(method.name for method in methods))
-        if any(method.is_ours for method in methods):
+        directory.begin(", ".join(method.name for method in chosen))
+        if any(method.is_ours for method in chosen):
             compile_ahead([f"{log.dimension}d", "rest"], progress.compiling)
         shared = directory.path / _SHARED
         shared.mkdir()
@@ -106,13 +95,14 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )
-        reference = _reference(replace(comparison, overrides=overrides), log, scans)
-        time_s = _LEAST_S + _SCAN_S * len(scans) if comparison.time_s is None else comparison.time_s
-        memory_mib = _SHARE * available_mib() if comparison.memory_mib is None else comparison.memory_mib
-        limits = Limits(time_s, memory_mib)
-        outcomes = run_all(methods, scans, shared, repeat=comparison.repeat, limits=limits, progress=progress)
+        reference = _reference(log, scans, ground_truth, relations, named(of_log, "log.ground_truth_topic"))
+        limits = Limits(
+            _LEAST_S + _SCAN_S * len(scans) if time_s is None else time_s,
+            _SHARE * available_mib() if memory_mib is None else memory_mib,
+        )
+        outcomes = run_all(chosen, scans, shared, repeat=repeat, limits=limits, progress=progress)
         progress.announce("evaluating and drawing")
-        results = results_of(methods, scans, outcomes, reference)
+        results = results_of(chosen, scans, outcomes, reference)
         write_results(directory.path, results)
         directory.end(stopped=stopped)
         table = summarize(results, log, limits, directory.provenance)
@@ -123,17 +113,18 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
     return Compared(directory.path, table)
 
 
-def _reference(comparison: Comparison, log: Log, scans: StoredScans) -> Reference:
+def _reference(
+    log: Log, scans: StoredScans, truth_file: Path | None, relations_file: Path | None, topic: str
+) -> Reference:
     """Reference of the errors, checked against the log before any method is run."""
     standing = Trajectory(scans.stamps_ns, np.tile(lie.identity(scans.dimension), (len(scans), 1, 1)))
     relations, note = None, ""
-    if comparison.relations is not None:
-        relations = read_relations(comparison.relations)
+    if relations_file is not None:
+        relations = read_relations(relations_file)
         relation_error(standing, relations)
     truth, source = log.ground_truth(), log.ground_truth_topic
-    topic = named(comparison.overrides, "log.ground_truth_topic")
-    if comparison.ground_truth is not None:
-        truth, source = read_truth(comparison.ground_truth).at(scans.stamps_ns), str(comparison.ground_truth)
+    if truth_file is not None:
+        truth, source = read_truth(truth_file).at(scans.stamps_ns), str(truth_file)
     elif topic not in ("", NO_TRUTH) and truth is None:
         raise InputError(f"{log.name}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
@@ -142,9 +133,9 @@ def _reference(comparison: Comparison, log: Log, scans: StoredScans) -> Referenc
             absolute_error_of_any_path(pairs)
             note = pairs.missing and f"Of {len(scans):,} scans {pairs.missing}"
         except InputError as error:
-            if comparison.ground_truth is not None or topic:
+            if truth_file is not None or topic:
                 raise
             truth, note = None, f"No accuracy against {source}: {error.text}"
     sources = [source] if truth is not None else []
-    sources += [str(comparison.relations)] if relations is not None else []
+    sources += [str(relations_file)] if relations is not None else []
     return Reference(truth, relations, " and ".join(sources), note)

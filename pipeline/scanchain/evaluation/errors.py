@@ -39,14 +39,12 @@ class Alignment(StrEnum):
     FIRST = "first"
     RIGID = "rigid"
 
-    @property
-    def description(self) -> str:
-        """Definition of the alignment as text."""
-        return {
-            Alignment.NONE: "frames taken as they are",
-            Alignment.FIRST: "first paired poses made equal",
-            Alignment.RIGID: "rigid least squares over the positions (Umeyama 1991, without scale)",
-        }[self]
+
+_ALIGNMENTS = {
+    Alignment.NONE: "frames taken as they are",
+    Alignment.FIRST: "first paired poses made equal",
+    Alignment.RIGID: "rigid least squares over the positions (Umeyama 1991, without scale)",
+}
 
 
 def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
@@ -153,12 +151,10 @@ class Metric:
 class AbsoluteError(Metric):
     """ATE over paired poses (Sturm et al. 2012, eq. 3; Zhang & Scaramuzza 2018).
 
-    alignment : how the frames were aligned
     translation_m : of ‖t_ref − t_est‖
     rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
     path_length_m : of the reference, over the paired poses
     T_reference_estimate : the alignment that was found
-    errors_m, errors_rad : (N,) in the order of the pairs
     """
 
     alignment: Alignment
@@ -203,7 +199,7 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
         rotations += " turned by the best common rotation"
     return AbsoluteError(
         definition=(
-            f"ATE: ‖t_ref − t_est‖ after alignment '{alignment}' ({alignment.description}) and the angle of "
+            f"ATE: ‖t_ref − t_est‖ after alignment '{alignment}' ({_ALIGNMENTS[alignment]}) and the angle of "
             f"{rotations}"
         ),
         pairing=pairs.description,
@@ -341,11 +337,9 @@ class LengthError:
 class KittiError:
     """Drift, averaged over all segments of all lengths (Geiger et al. 2012).
 
-    definition : of the figures, as text; pairing : over which poses
     translation_share : ‖t‖ / length; times 100 it is the published per cent
     rotation_rad_per_m : angle / length
-    stretches : number of segments
-    by_length : the same, length by length
+    stretches : number of segments, in all and in ``by_length``
     """
 
     __repr__ = brief
@@ -361,8 +355,7 @@ class KittiError:
         """The figures in one line, in the units they are published in."""
         return (
             f"KITTI translation {100.0 * self.translation_share:.4f} %, rotation "
-            f"{np.degrees(self.rotation_rad_per_m):.6f} deg/m over "
-            f"{counted(self.stretches, 'segment')}"
+            f"{np.degrees(self.rotation_rad_per_m):.6f} deg/m over {counted(self.stretches, 'segment')}"
         )
 
 

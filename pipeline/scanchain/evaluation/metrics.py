@@ -187,15 +187,16 @@ def evaluate(
     pairs = scaled(pairs, factor)
     ate = absolute_error(pairs, Alignment(align))
     complaint = far_off(ate.translation_m.rmse, ate.share_of_path, ate.path_length_m)
-    warnings = [*filter(None, [complaint]), *pairs.warnings]
+    warnings = [complaint, *pairs.warnings] if complaint else pairs.warnings
     aligned = ate.T_reference_estimate @ pairs.estimate
     errors, missing = relative_errors(pairs, intervals)
-    found: dict[str, Result] = {"ate": ate, **errors}
-    start_m, after = pairs.start_error_m, None
+    after = None
     with suppress(InputError):  # no alignment is determined without the first pose
         after = absolute_error(pairs.after_start, Alignment(align)) if pairs.starts else None
-    said = (found, missing, pairs.description, warnings, factor, offset_s, start_m, after)
-    return Results(*said, aligned, pairs.reference)
+    return Results(
+        {"ate": ate, **errors}, missing, pairs.description, warnings, factor, offset_s, pairs.start_error_m, after,
+        aligned, pairs.reference,
+    )  # fmt: skip
 
 
 def _intervals(text: str) -> list[tuple[float, str]]:

@@ -29,7 +29,6 @@ _SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's sca
 class Pairs:
     """Estimate and reference, pose by pose, in the order and at the stamps of the estimate.
 
-    stamps_ns : (N,) int64, the estimate's
     estimate, reference : (N, 4, 4) poses; SE(2) lifted into the plane z = 0
     places : (N,) int64, indices of the poses in the estimate
     estimate_count, reference_count : numbers of poses before pairing
@@ -95,18 +94,16 @@ class Pairs:
     @property
     def description(self) -> str:
         """Description of the pairs and of the interpolation."""
-        exact = len(self) - self.interpolated
-        how = ""
-        if self.interpolated:
-            how = (
-                f": {exact:,} as they are, {self.interpolated:,} interpolated (position linear, rotation by "
-                f"SLERP, gaps up to {self.gap_s:.3g} s), none extrapolated"
-            )
-        return (
+        text = (
             f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with "
-            f"the reference (of {counted(self.reference_count, 'pose')}) at its stamp{how}"
-            + (f"; {self.missing}" if self.missing else "")
+            f"the reference (of {counted(self.reference_count, 'pose')}) at its stamp"
         )
+        if self.interpolated:
+            text += (
+                f": {len(self) - self.interpolated:,} as they are, {self.interpolated:,} interpolated (position "
+                f"linear, rotation by SLERP, gaps up to {self.gap_s:.3g} s), none extrapolated"
+            )
+        return f"{text}; {self.missing}" if self.missing else text
 
     @property
     def warnings(self) -> list[str]:
@@ -241,10 +238,7 @@ def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TruthFile:
-    """Poses of the lidar from a TUM file, or from a KITTI file, whose k-th row is the k-th scan's.
-
-    ``has_stamps`` : whether the stamps of ``poses`` are times
-    """
+    """Poses of the lidar from a TUM file, or from a KITTI file, without stamps, one row per scan."""
 
     path: Path
     poses: Trajectory

@@ -19,8 +19,7 @@ from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, metho
 from scanchain.comparison.table import read_table
 from scanchain.data import ClosureVerdict, GraphState
 from scanchain.graph.optimization import GraphChange
-from scanchain.landmarks.results import file_stem
-from scanchain.landmarks.study import Estimate, Study
+from scanchain.landmarks.study import Estimate, Study, file_stem
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RECORDING_FILE, SUMMARY_FILE
 from scanchain.sessions.change_run import COLORS

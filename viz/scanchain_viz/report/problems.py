@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scanchain.data import GraphState
 from scanchain.errors import InputError
 from scanchain.graph.optimization import GraphChange, fit
-from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.solvers import MethodResult
-from scanchain.landmarks.study import Estimate, Study
+from scanchain.landmarks.study import Estimate, Study, accuracy_lines, file_stem, size_of, table_of
 from scanchain_viz.colors import palette_of
 from scanchain_viz.pictures.figure import INK, Plot, around, broken, write_png
 from scanchain_viz.report import page

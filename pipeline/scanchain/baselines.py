@@ -1,4 +1,8 @@
-"""Third-party odometries: KISS-ICP, GenZ-ICP, small_gicp, and Open3D's ICP from scan to scan; their protocol."""
+"""Third-party odometries by name: KISS-ICP, GenZ-ICP, small_gicp, and Open3D's ICP from scan to scan.
+
+A new one is a class, as ``Baseline`` describes it, and a line in ``BASELINES``. Outside of the package,
+``scanchain compare --methods my_module:MyClass`` runs a class of yours, given its table of --config as keywords.
+"""
 
 from __future__ import annotations
 
