@@ -11,8 +11,8 @@ import pytest
 
 from scanchain import catalog
 from scanchain.__main__ import main
-from scanchain.download import DownloadError, fetch
-from scanchain.errors import InputError
+from scanchain.download import fetch
+from scanchain.errors import InputError, ScanchainError
 from scanchain.logs import open_log
 from tests.support import recorders
 from tests.support.sensor_files import flaser, kitti_raw, save
@@ -50,7 +50,7 @@ def test_a_line_that_breaks_is_gone_on_with_and_nothing_comes_twice(site, tmp_pa
 
 def test_a_download_that_was_given_up_is_resumed_by_the_next_call(site, tmp_path):
     site.cuts = [700_000, 0, 0, 0]
-    with pytest.raises(DownloadError, match="700,000 bytes are kept"):
+    with pytest.raises(ScanchainError, match="700,000 bytes are kept"):
         fetch(f"{site.url}/file.bin", tmp_path / "a")
     assert left(tmp_path) == [".a.part"]
     fetch(f"{site.url}/file.bin", tmp_path / "a")
@@ -78,13 +78,13 @@ def test_a_wrong_checksum_leaves_nothing(site, tmp_path):
 
 
 def test_what_is_not_there_or_no_web_address_is_one_line(site, tmp_path):
-    with pytest.raises(DownloadError, match=r"/absent: 404 Not Found"):
+    with pytest.raises(ScanchainError, match=r"/absent: 404 Not Found"):
         fetch(f"{site.url}/absent", tmp_path / "a")
     for url in ("file:///etc/passwd", "ftp://host/a", "intel.clf"):
         with pytest.raises(InputError, match="no address of a web server"):
             fetch(url, tmp_path / "a")
     assert left(tmp_path) == []
-    with pytest.raises(DownloadError, match=r"127\.0\.0\.1:9/a: .*; 0 bytes are kept"):
+    with pytest.raises(ScanchainError, match=r"127\.0\.0\.1:9/a: .*; 0 bytes are kept"):
         fetch("http://127.0.0.1:9/a", tmp_path / "a")
 
 

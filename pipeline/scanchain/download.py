@@ -21,16 +21,13 @@ _ATTEMPTS = 4
 _BROKEN = (http.client.HTTPException, ConnectionError, TimeoutError, urllib.error.URLError)
 
 
-class DownloadError(ScanchainError):
-    """A file that could not be downloaded; the part received is retained for the next try."""
-
-
 def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress | None = None) -> None:
     """Download a file unless it exists, resuming an earlier try.
 
     sha256 : the expected hash, empty if unknown
     progress : called with the MiB received and their total, 0 if unknown
-    Raises InputError if the hash differs or the address is not of HTTP; DownloadError if the download fails.
+    Raises InputError if the hash differs or the address is not of HTTP; ScanchainError if the download fails,
+    the part received being retained for the next try.
     """
     if urlsplit(url).scheme not in ("http", "https"):
         raise InputError(f"{url}: is no address of a web server; give one with http:// or https://")
@@ -60,13 +57,13 @@ def _complete(url: str, part: Path, progress: Progress | None) -> None:
             reason = "the server ended too early, or has a file of another length by now"
         except urllib.error.HTTPError as error:
             if error.code != http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
-                raise DownloadError(f"{url}: {error.code} {error.reason}; see whether its page moved") from error
+                raise ScanchainError(f"{url}: {error.code} {error.reason}; see whether its page moved") from error
             part.unlink()
             reason = "the file on the server is not longer than the one begun"
         except _BROKEN as error:
             reason = str(getattr(error, "reason", error)) or type(error).__name__
     have = part.stat().st_size if part.exists() else 0
-    raise DownloadError(f"{url}: {reason}; {have:,} bytes are kept, call it again to resume")
+    raise ScanchainError(f"{url}: {reason}; {have:,} bytes are kept, call it again to resume")
 
 
 def _more(url: str, part: Path, progress: Progress | None) -> bool:

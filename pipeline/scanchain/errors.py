@@ -74,9 +74,8 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-_NO_SPACE = "the disk is full; free some space on it, or write to another one"
 _REMEDIES = {
-    errno.ENOSPC: _NO_SPACE,
+    errno.ENOSPC: "the disk is full; free some space on it, or write to another one",
     errno.EDQUOT: "the quota of the disk is used up; free some space on it, or write to another one",
     errno.EFBIG: "File too large: raise the limit of file sizes (ulimit -f), or write to another disk",
     errno.ENAMETOOLONG: "the name is longer than the file system takes (255 bytes per part); shorten it",

@@ -32,8 +32,6 @@ def peak_mib() -> float:
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024.0
-    if sys.platform == "win32":
-        return psutil.Process().memory_info().peak_wset / _MIB
     import resource  # of POSIX only
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MIB  # bytes on macOS

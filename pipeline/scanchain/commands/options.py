@@ -77,16 +77,12 @@ class OverrideCommand(click.Command):
         return unused
 
 
-def _set(ctx: click.Context, override: Override) -> None:
-    ctx.meta.setdefault(_ALIASES, []).append(override)
-
-
 def key(flag: str, name: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
     """An option that sets a configuration key; with ``value``, a flag without argument that sets this value."""
 
     def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
         if given not in (None, False):
-            _set(ctx, Override(name, value or str(given), flag))
+            ctx.meta.setdefault(_ALIASES, []).append(Override(name, value or str(given), flag))
 
     return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
 
@@ -164,7 +160,8 @@ def ground_truth(
             return None
         path = Path(text)
         if text == NO_TRUTH or (text.startswith("/") and not path.exists() and not path.suffix):
-            return _set(ctx, Override("log.ground_truth_topic", text, "--gt"))
+            ctx.meta.setdefault(_ALIASES, []).append(Override("log.ground_truth_topic", text, "--gt"))
+            return None
         return path
 
     return click.option("--gt", "ground_truth", metavar=metavar, callback=keep, help=help)

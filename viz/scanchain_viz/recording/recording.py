@@ -20,7 +20,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Step, Trajectory
-from scanchain.errors import InputError
+from scanchain.errors import InputError, ScanchainError
 from scanchain.runs.job import SinkName
 from scanchain.steps import Steps
 from scanchain.verdict import Judged, Kind
@@ -164,10 +164,10 @@ class Recording:
             elif "spawn" in self.sinks:
                 viewer.start_window()
             elif not viewer.is_listening(viewer.PORT):
-                raise viewer.ViewerError(
+                raise ScanchainError(
                     f"no viewer at {viewer.HOST}:{viewer.PORT}, the run goes on without it; open one with: rerun"
                 )
-        except (viewer.ViewerError, OSError) as error:
+        except (ScanchainError, OSError) as error:
             self.problems.append(str(error))
             return ""
         return viewer.grpc_address()

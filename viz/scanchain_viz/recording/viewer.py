@@ -24,10 +24,6 @@ _START_S = 8.0
 _SETTLE_S = 0.5
 
 
-class ViewerError(ScanchainError):
-    """There is no viewer; the message says what failed and what to do, on one line."""
-
-
 def grpc_address() -> str:
     """Address at which a viewer on this machine accepts data."""
     return f"rerun+http://{HOST}:{PORT}/proxy"
@@ -57,7 +53,9 @@ def start_window() -> None:
     if is_listening(PORT):
         return
     if not has_display():
-        raise ViewerError("no viewer spawned: there is no display; use --rerun web, or open the recording later")
+        raise ScanchainError(
+            "no viewer spawned: there is no display; use --rerun web, or open the recording later"
+        )
     _launch((PORT,), "--expect-data-soon")
 
 
@@ -65,7 +63,7 @@ def start_web(*recordings: Path) -> subprocess.Popen[bytes]:
     """Serve the web viewer on this machine only: of .rrd files, or of what is sent to ``PORT``."""
     for taken in (PORT, WEB_PORT):
         if is_listening(taken):
-            raise ViewerError(
+            raise ScanchainError(
                 f"no web viewer: port {taken} is taken; close the program that uses it (another viewer?)"
             )
     return _launch((PORT, WEB_PORT), "--serve-web", "--web-viewer-port", str(WEB_PORT), *map(str, recordings))
@@ -101,7 +99,7 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
     listening_since = None
     while monotonic() < deadline:
         if process.poll() is not None:
-            raise ViewerError(
+            raise ScanchainError(
                 f"no viewer: it exited immediately with code {process.returncode}; try `rerun` on its own"
             )
         if listening_since is None and all(is_listening(port) for port in ports):
@@ -109,7 +107,7 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
         if listening_since is not None and monotonic() - listening_since > _SETTLE_S:
             return
         sleep(0.02)
-    raise ViewerError(f"no viewer: it did not respond within {_START_S:.0f} s; try `rerun` on its own")
+    raise ScanchainError(f"no viewer: it did not respond within {_START_S:.0f} s; try `rerun` on its own")
 
 
 def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> None:
@@ -130,7 +128,7 @@ def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> No
         if has_display():
             webbrowser.open(address)
         code = server.wait()
-        raise ViewerError(f"the web viewer of {path} ended with code {code}; try `rerun {path}` on its own")
+        raise ScanchainError(f"the web viewer of {path} ended with code {code}; try `rerun {path}` on its own")
     except KeyboardInterrupt:
         return
     finally:  # whatever ends this ends the server
