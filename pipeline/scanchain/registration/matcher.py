@@ -65,7 +65,7 @@ class CheckedMatcher:
             if not isinstance(value, int | np.integer if field in _COUNTS else int | float | np.number):
                 wanted = "a whole number" if field in _COUNTS else "a number"
                 raise InputError(f"{of} {field} is {shown(value)}; wanted {wanted}")
-        worst = match.degeneracy_direction if np.size(match.degeneracy_direction) else np.zeros(k)
+        worst = match.degeneracy_direction if np.size(match.degeneracy_direction) else np.eye(k)[0]
         return replace(
             match,
             T_target_source=checks.pose(match.T_target_source, f"{of} T_target_source", d),
