@@ -75,7 +75,7 @@ def test_a_transform_that_the_motions_contradict_is_named_and_one_that_they_conf
     says(
         text,
         "lidar at x 0.20, y 0.00 m of the base",
-        "contradict the mounting that was taken: lidar turned by 180.",
+        "contradict the assumed mounting: lidar turned by 180.",
     )
     assert re.search(r"deg, 0\.(19|20|21) m ahead of the base", text), text
     assert "disagree" not in text
