@@ -18,7 +18,7 @@ from scanchain.loops.verification import Verifier
 from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
 from scanchain.odometry.odometry import first_match
 from scanchain.runs.job import Job, Progress
-from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
+from scanchain.sessions.joining import Joined, changed, graph_of, objection_to
 from scanchain.sessions.merged_map import session_names
 from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
@@ -252,10 +252,10 @@ def test_a_join_without_enough_evidence_is_not_made_but_told_with_its_pose(runs,
     folder, truth = runs
     evening = list(PARTS).index("evening")
 
-    def doubt(joined, old, config):
+    def objection(joined, old, config):
         return "a reason" if evening in joined.maps else ""
 
-    monkeypatch.setattr("scanchain.sessions.joining.doubt_about", doubt)
+    monkeypatch.setattr("scanchain.sessions.joining.objection_to", objection)
     code, _, said = call("merge", *(folder / name for name in PARTS), "--out", tmp_path / "out")
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert code == 0
@@ -269,7 +269,7 @@ def test_a_join_without_enough_evidence_is_not_made_but_told_with_its_pose(runs,
     assert np.linalg.norm(lie.between(*true)[:2, 2] - join["position_m"]) < 0.1
     assert "noon might begin at" in said + (tmp_path / "out" / "summary.txt").read_text()
     assert "noon might begin at" in (tmp_path / "out" / "report.html").read_text()
-    monkeypatch.setattr("scanchain.sessions.joining.doubt_about", lambda joined, old, config: "a reason")
+    monkeypatch.setattr("scanchain.sessions.joining.objection_to", lambda joined, old, config: "a reason")
     code, _, said = call("merge", folder / "noon", folder / "evening", "--out", tmp_path / "two")
     assert code == 1
     assert "no two of the maps belong together for certain: noon might begin at" in said
@@ -291,10 +291,10 @@ def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(re
     match = first_match(lie.identity(2), np.empty((0, 2)), config.matching)
     closures = tuple(Closure(i, j, match, 0.95, ClosureVerdict.ACCEPTED, "") for i, j in pairs.tolist())
     joined = Joined((0, 1), keyframes, np.repeat([0, 1], count), edges, closures)
-    doubt = doubt_about(joined, count, config)
-    assert ("also fit other locations" in doubt) == bool(doubt) == repeats
+    objection = objection_to(joined, count, config)
+    assert ("also fit other locations" in objection) == bool(objection) == repeats
     few = replace(joined, edges=edges.where(pairs[:, 0] < 3))
-    assert "short path" in doubt_about(few, count, config)
+    assert "short path" in objection_to(few, count, config)
 
 
 def _corridor(x_m, index, depths_m):

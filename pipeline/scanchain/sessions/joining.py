@@ -88,7 +88,7 @@ class Joined:
         return replace(self, keyframes=tuple(replace(each, T_odom_lidar=pose) for each, pose in moved))
 
 
-class Doubt(msgspec.Struct, frozen=True):
+class UncertainJoin(msgspec.Struct, frozen=True):
     """A session that may belong to the frame of another one, but is not joined for lack of evidence.
 
     position_m, yaw_deg : of its first keyframe there
@@ -111,7 +111,7 @@ class Doubt(msgspec.Struct, frozen=True):
         )
 
     @classmethod
-    def of(cls, session: str, frame: str, T_frame_session: Pose, reason: str) -> Doubt:
+    def of(cls, session: str, frame: str, T_frame_session: Pose, reason: str) -> UncertainJoin:
         """The uncertain join of a session at a pose (d+1, d+1)."""
         T = T_frame_session
         position_m, yaw_deg = np.round(T[:-1, -1], 2), np.round(np.degrees(np.arctan2(T[1, 0], T[0, 0])), 1)
@@ -125,7 +125,7 @@ def join_all(
     config: Config,
     held: int,
     say: Callable[[str], None],
-) -> tuple[list[Joined], list[Doubt]]:
+) -> tuple[list[Joined], list[UncertainJoin]]:
     """Groups of maps that belong together, each in the frame of its first map; and uncertain joins.
 
     Of the maps that are found in a group, the one with the largest overlap joins it. A map that is not found is
@@ -135,7 +135,7 @@ def join_all(
     held : number of a map whose keyframes stay where they are, −1 for none
     """
     groups: list[Joined] = []
-    doubts: dict[int, Doubt] = {}
+    uncertain: dict[int, UncertainJoin] = {}
     waiting = list(order)
     while waiting:
         world = Joined.of(waiting.pop(0), maps)
@@ -155,14 +155,16 @@ def join_all(
             for number, trial in sorted(trials.items(), key=lambda each: -_overlap(each[1], old)):
                 if joined is not None:
                     searched[number] = 0
-                elif reason := doubt_about(trial, old, config):
-                    doubts[number] = Doubt.of(names[number], names[world.maps[0]], trial.poses[old], reason)
+                elif reason := objection_to(trial, old, config):
+                    uncertain[number] = UncertainJoin.of(
+                        names[number], names[world.maps[0]], trial.poses[old], reason
+                    )
                 else:
                     joined = trial
                     waiting.remove(number)
-                    doubts.pop(number, None)
+                    uncertain.pop(number, None)
         groups.append(world)
-    return groups, list(doubts.values())
+    return groups, list(uncertain.values())
 
 
 def _has_grown(world: Joined, before: int) -> bool:
@@ -260,7 +262,7 @@ def changed(joined: Joined) -> dict[int, float]:
     return found
 
 
-def doubt_about(joined: Joined, old: int, config: Config) -> str:
+def objection_to(joined: Joined, old: int, config: Config) -> str:
     """Reason why the keyframes from ``old`` on may belong elsewhere, empty if there is none.
 
     The evidence is tested as for a log in a map, at optimized poses. What agrees is searched for elsewhere.

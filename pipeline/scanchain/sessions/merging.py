@@ -22,7 +22,7 @@ from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import removed
 from scanchain.runs.results import Cloud, cloud_of
 from scanchain.sessions.alignment import opened_maps
-from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
+from scanchain.sessions.joining import Joined, UncertainJoin, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
 from scanchain.settings import load_settings
 
@@ -64,7 +64,7 @@ class MergeMetrics(msgspec.Struct, frozen=True):
     map_points: int
     moving_points_removed: int
     apart: tuple[tuple[str, ...], ...] = ()
-    uncertain: tuple[Doubt, ...] = ()
+    uncertain: tuple[UncertainJoin, ...] = ()
     warnings: tuple[str, ...] = ()
     updated: bool = False
     run_s: float = 0.0
@@ -164,7 +164,9 @@ def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
     return sorted(range(len(maps)), key=key)
 
 
-def _chosen(groups: Sequence[Joined], held: int, maps: Sequence[SavedMap], uncertain: Sequence[Doubt]) -> Joined:
+def _chosen(
+    groups: Sequence[Joined], held: int, maps: Sequence[SavedMap], uncertain: Sequence[UncertainJoin]
+) -> Joined:
     """The group with the fixed map, else the one with the most maps or, if equal, the most keyframes."""
     chosen = max(groups, key=lambda group: (held in group.maps, len(group.maps), len(group.keyframes)))
     if len(chosen.maps) > 1:
@@ -180,10 +182,10 @@ def _chosen(groups: Sequence[Joined], held: int, maps: Sequence[SavedMap], uncer
     )
 
 
-def _apart_text(names: Sequence[str], uncertain: Sequence[Doubt]) -> str:
-    doubts = "; ".join(each.text for each in uncertain if {each.session, each.frame} & set(names))
+def _apart_text(names: Sequence[str], uncertain: Sequence[UncertainJoin]) -> str:
+    reasons = "; ".join(each.text for each in uncertain if {each.session, each.frame} & set(names))
     together = "; they belong together: merge them on their own" if len(names) > 1 else ""
-    return f"{', '.join(names)}: not in this map; {doubts or 'too few closures agree'}{together}"
+    return f"{', '.join(names)}: not in this map; {reasons or 'too few closures agree'}{together}"
 
 
 def _changed_text(name: str, share: float) -> str:
