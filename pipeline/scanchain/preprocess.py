@@ -9,15 +9,16 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import checks
+from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import PreprocessConfig
-from scanchain.data import Points, Scan
+from scanchain.data import Points, Pose, Scan
 from scanchain.kernels import scans as kernels
 from scanchain.range_noise import RangeNoise
 
@@ -31,6 +32,24 @@ _STEP = 2.0  # factor by which the voxels of matching shrink or grow from one sc
 _MAX_TRIES = 8  # number of times the first scan is downsampled, at most
 _AHEAD = 2  # scans that are prepared before they are asked for
 _ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the choice of points would flicker
+
+
+class ScanMotion(NamedTuple):
+    """Motion of the lidar during a scan, at a constant twist.
+
+    twist : (k,) per second, lidar frame
+    """
+
+    twist: NDArray[np.float64]
+
+    def over(self, seconds: float) -> Pose:
+        """Motion (d+1, d+1) over some seconds."""
+        return lie.exp(seconds * self.twist)
+
+    def deskew(self, points: Points, times_s: NDArray[np.float64]) -> None:
+        """Move points (N, d), each in the lidar frame of its time (N,), to that of time 0, in place."""
+        move = kernels.deskew_in_plane if points.shape[1] == 2 else kernels.deskew_in_space
+        move(points, times_s, self.twist)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +81,9 @@ class Sweep:
         times_s = self.times_s[chosen] if self.is_distorted else self.times_s
         return Sweep(self.points.take(chosen, axis=0), times_s, self.middle_s)
 
-    def from_middle(self, velocity: NDArray[np.float64]) -> Points:
+    def from_middle(self, motion: ScanMotion) -> Points:
         """The points (M, d) deskewed to the lidar's pose in the middle of the scan.
 
-        velocity : (k,) twist per second in the lidar frame, constant through the scan
         Why the middle: an error of the velocity then moves as many points forward as back, and the pose stays
         right. Relative to the first point it would shift the pose by half of itself, the next velocity by as
         much in the other direction, and so on.
@@ -73,8 +91,7 @@ class Sweep:
         if not self.is_distorted:
             return self.points
         points = self.points.copy()
-        deskew = kernels.deskew_in_plane if points.shape[1] == 2 else kernels.deskew_in_space
-        deskew(points, self.times_s, velocity)
+        motion.deskew(points, self.times_s)
         return points
 
 

@@ -8,7 +8,7 @@ import pytest
 from scanchain import preprocess
 from scanchain.config import PreprocessConfig
 from scanchain.data import Scan
-from scanchain.preprocess import Resolution, downsample, prepare_ahead, sweep_of
+from scanchain.preprocess import Resolution, ScanMotion, downsample, prepare_ahead, sweep_of
 from tests.support import naive
 from tests.support.scenes import configured
 
@@ -32,7 +32,7 @@ def test_a_sweep_is_the_first_point_of_every_voxel_in_range_and_seen_from_its_mi
     np.testing.assert_allclose(sweep.times_s, scan.times_s[chosen] - sweep.middle_s, atol=1e-7)
     velocity = np.array([8.0, 0.5, 0.3] if dimension == 2 else [8.0, 0.5, -0.2, 0.1, -0.2, 0.6])
     wanted = naive.deskew(sweep.points, sweep.times_s, velocity)
-    np.testing.assert_allclose(sweep.from_middle(velocity), wanted, atol=1e-9)
+    np.testing.assert_allclose(sweep.from_middle(ScanMotion(velocity)), wanted, atol=1e-9)
     assert np.array_equal(sweep.points, scan.points[chosen].astype(float))
 
 
@@ -53,7 +53,7 @@ def test_without_times_or_with_deskewing_off_points_stay_where_they_are(with_tim
     config = configured(3, {"preprocess.deskew": deskew}).preprocess
     sweep = sweep_of(some_scan(with_times=with_times), config)
     assert not sweep.is_distorted and sweep.middle_s == 0.0
-    assert np.array_equal(sweep.from_middle(np.ones(6)), sweep.points)
+    assert np.array_equal(sweep.from_middle(ScanMotion(np.ones(6))), sweep.points)
     assert not sweep.downsampled(4.0).is_distorted
 
 

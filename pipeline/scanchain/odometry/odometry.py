@@ -156,7 +156,7 @@ class Odometry:
         registered = self._register(scan, sweep, sparse, prediction)
         aligned = working_s()
         self.predictor.correct(scan, registered.prediction, registered.match, registered.state)
-        points = sweep.from_middle(self.predictor.velocity)
+        points = sweep.from_middle(self.predictor.scan_motion)
         self._extend(points, registered)
         self._calibrate(points, registered.state)
         match = registered.match if registered.rival is None else spread(registered.match, registered.rival)
@@ -192,7 +192,7 @@ class Odometry:
             return prediction
         free = self.predictor.predict(scan, by_wheels=False)
         is_wrong = lie.apart(prediction.T_odom_last, prediction.T_odom_lidar)[0] > free.farthest_m
-        points = sparse.from_middle(free.velocity)
+        points = sparse.from_middle(free.scan_motion)
         if not is_wrong and len(points) and not self.predictor.doubts_scans:
             there, here = (
                 self.matcher.align(points, self.local_map, each.T_odom_lidar, each.prior, wide=True)
@@ -209,7 +209,7 @@ class Odometry:
         is_first = not len(self.map.surfaces)
         if is_first:
             self._check_range(scan, sparse)
-        points = sparse.from_middle(prediction.velocity)
+        points = sparse.from_middle(prediction.scan_motion)
         if not len(points):
             match = nothing_to_match(prediction, self.config)
             return _Registered(points, match, State.LOST, prediction)
@@ -239,20 +239,20 @@ class Odometry:
         return _Registered(points, match, state, prediction, rival=None if state is State.LOST else rival)
 
     def _deskewed(self, sparse: Sweep, match: Match, prediction: Prediction) -> tuple[Points, Match, Prediction]:
-        """Deskew again with the velocity from the match, and align again.
+        """Deskew again with the motion by the match, and align again.
 
         The second scan also gives the velocity of the first one, which is distorted in the map until then.
         """
         T_odom_middle, prior = match.T_target_source, prediction.prior
-        velocity = prediction.velocity_by(lie.log(lie.between(prediction.T_odom_last, T_odom_middle)))
+        motion = prediction.scan_motion_by(lie.log(lie.between(prediction.T_odom_last, T_odom_middle)))
         if prediction.is_second:
-            T_moved = lie.exp(self.first_sweep.middle_s * velocity)  # the pose at its stamp stays the same
-            self.first_points = lie.transform(T_moved, self.first_sweep.from_middle(velocity))
+            T_moved = motion.over(self.first_sweep.middle_s)  # the pose at its stamp stays the same
+            self.first_points = lie.transform(T_moved, self.first_sweep.from_middle(motion))
             self.map.replace([(self.first_points, lie.identity(self.dimension))])
             T_odom_middle = T_moved @ T_odom_middle
             prior = prior._replace(T_target_source=T_moved @ prior.T_target_source)
             prediction = msgspec.structs.replace(prediction, T_odom_last=T_moved)
-        points = sparse.from_middle(velocity)
+        points = sparse.from_middle(motion)
         match = self.matcher.align(points, self.local_map, T_odom_middle, prior)
         error = prediction.deskewing_error(match.T_target_source, sparse.duration_s)
         return points, blurred(match, error), prediction
@@ -287,7 +287,7 @@ class Odometry:
         """Add the scan to the elevation calibration; rebuild the map where the offset changes."""
         if state is State.LOST:
             self.elevation.reset()
-        if state is State.LOST or not self.predictor.velocity.any():  # the first scan cannot be deskewed
+        if state is State.LOST or not self.predictor.scan_motion.twist.any():  # the first scan cannot be deskewed
             return
         corrected = self.elevation.update(points, self.predictor.T_odom_lidar)
         if corrected:
@@ -304,7 +304,7 @@ class Odometry:
         if sweep.middle_s == 0.0 or prediction.lasted_s <= 0.0:
             return tracked
         mean = lie.log(self.predictor.T_previous_current) / prediction.lasted_s
-        change = (1.0 - sweep.middle_s / prediction.lasted_s) * (self.predictor.velocity - mean)
+        change = (1.0 - sweep.middle_s / prediction.lasted_s) * (self.predictor.scan_motion.twist - mean)
         change[: self.dimension] = 0.0
         T_stamp_middle = lie.exp(sweep.middle_s * (mean + change))
         T_middle_stamp = lie.inverse(T_stamp_middle)

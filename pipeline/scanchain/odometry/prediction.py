@@ -18,6 +18,7 @@ from scanchain.kernels.registration.observability import WEAK
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import ErrorStatistics, MotionFilter
 from scanchain.odometry.wheels import Wheels
+from scanchain.preprocess import ScanMotion
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps are too close
@@ -48,7 +49,7 @@ class Prediction(msgspec.Struct, frozen=True):
     prior : predicted pose and its covariance
     source : what predicts it
     is_guess : whether scans are missing before this one, so that the error may be large
-    velocity : (k,) twist per second at the last scan, lidar frame
+    scan_motion : that during the last scan
     T_odom_last, T_previous_current : pose of the last scan, (d+1, d+1), and its motion since the one before
     interval_s, last_s, usual_s : the interval since the last scan, the one before, the usual one; 0 where unknown
     silence_s : since the last scan by stamps that log times confirm, else 0
@@ -60,7 +61,7 @@ class Prediction(msgspec.Struct, frozen=True):
     prior: Prior
     source: Source
     is_guess: bool
-    velocity: NDArray[np.float64]
+    scan_motion: ScanMotion
     T_odom_last: Pose
     T_previous_current: Pose
     interval_s: float
@@ -135,18 +136,19 @@ class Prediction(msgspec.Struct, frozen=True):
         scaled = tuple(T @ _motion_over(*moving, share=share) for share in (0.5, 1.0, 1.5))
         return T @ self.T_previous_current, *scaled, T
 
-    def velocity_by(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist (k,) per second at a scan after this motion (k,); the last one if stamps do not increase.
+    def scan_motion_by(self, motion: NDArray[np.float64]) -> ScanMotion:
+        """Motion during a scan after this motion (k,) to it; that of the last one if stamps do not increase.
 
         The mean since the last scan, extrapolated by half an interval with the acceleration between the last two.
         """
         lasted_s, before_s = self.lasted_s, self.before_s
         if lasted_s <= 0.0:
-            return self.velocity
+            return self.scan_motion
         mean = motion / lasted_s
         if not 0.0 < lasted_s < _EVEN * before_s < _EVEN**2 * lasted_s:
-            return mean
-        return mean + lasted_s / (lasted_s + before_s) * (mean - lie.log(self.T_previous_current) / before_s)
+            return ScanMotion(mean)
+        change = mean - lie.log(self.T_previous_current) / before_s
+        return ScanMotion(mean + lasted_s / (lasted_s + before_s) * change)
 
     def deskewing_error(self, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
         """(k,) approximate error of a scan of this duration after deskewing at constant velocity.
@@ -155,7 +157,7 @@ class Prediction(msgspec.Struct, frozen=True):
         scan of T seconds; a is taken from the last two motions.
         """
         if self.lasted_s <= 0.0 or self.is_second:
-            return np.zeros(len(self.velocity))
+            return np.zeros(len(self.scan_motion.twist))
         mean = lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.lasted_s
         return (mean - lie.log(self.T_previous_current) / self.before_s) / self.lasted_s * duration_s**2 / 24.0
 
@@ -173,7 +175,7 @@ class Predictor:
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         k = lie.twist_size(T_base_lidar)
-        self.velocity = np.zeros(k)
+        self.scan_motion = ScanMotion(np.zeros(k))
         self.wheels = Wheels(config, T_base_lidar, is_mounted=is_mounted)
         of_velocity = ErrorStatistics(lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad))
         self.statistics = {Source.CONSTANT_VELOCITY: of_velocity, Source.WHEELS: self.wheels.statistics}
@@ -206,7 +208,7 @@ class Predictor:
             prior=Prior(T_predicted, covariance, widest, is_measured=source.is_measured),
             source=source,
             is_guess=is_guess,
-            velocity=self.velocity,
+            scan_motion=self.scan_motion,
             T_odom_last=self.T_odom_lidar,
             T_previous_current=self.T_previous_current,
             interval_s=interval_s,
@@ -229,7 +231,7 @@ class Predictor:
         self.lost_s = self.lost_s + prediction.interval_s if state is State.LOST else 0.0
         if self.intervals.last_scan is not None:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
-            self.velocity = prediction.velocity_by(lie.log(self.T_previous_current))
+            self.scan_motion = prediction.scan_motion_by(lie.log(self.T_previous_current))
             self._update(prediction, match, state)
         self.scans += 1
         is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)

@@ -106,7 +106,7 @@ class Recovery:
 
         tried : the given alignment; further ones are appended
         """
-        structure = sweep.from_middle(prediction.velocity)
+        structure = sweep.from_middle(prediction.scan_motion)
         best = tried[0]
         for half_width_m, half_width_rad in prediction.windows():
             radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m

@@ -20,7 +20,7 @@ from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.odometry.distortion import choose_point_times
-from scanchain.preprocess import Resolution
+from scanchain.preprocess import Resolution, ScanMotion
 from scanchain.registration import MapKeeper, create_matcher
 from scanchain.runs.directory import METRICS_FILE
 from scanchain.runs.evidence import evidence_of, evidence_of_trajectory
@@ -138,11 +138,12 @@ def _matched(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> t
     resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
     keeper, matcher = MapKeeper(trajectory.dimension, config.local_map), create_matcher(config.matching)
     corrections, figures = [], []
-    for scan, T_world_lidar, velocity in zip(scans, trajectory.poses, velocities(trajectory), strict=True):
+    for scan, T_world_lidar, twist in zip(scans, trajectory.poses, velocities(trajectory), strict=True):
         sweep, sparse = resolution.downsampled(scan)
         keeper.resize(resolution.scale)
-        points = sparse.from_middle(velocity)
-        T_world_middle = T_world_lidar @ lie.exp(sweep.middle_s * velocity)
+        motion = ScanMotion(twist)
+        points = sparse.from_middle(motion)
+        T_world_middle = T_world_lidar @ motion.over(sweep.middle_s)
         correction, figure = lie.identity(trajectory.dimension), (1.0, np.inf, np.nan)
         if len(keeper.surfaces) and len(points):
             match = matcher.align(points, keeper.surfaces, T_world_middle)
@@ -151,5 +152,5 @@ def _matched(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> t
             figure = (match.inlier_share, match.observability, match.fit * is_near)
         corrections.append(correction)
         figures.append(figure)
-        keeper.extend(sweep.from_middle(velocity), T_world_middle)
+        keeper.extend(sweep.from_middle(motion), T_world_middle)
     return np.array(corrections), np.array(figures).T
