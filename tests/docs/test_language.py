@@ -29,6 +29,7 @@ WORDS = {
     "as known at": "as estimated at",
     "milliseconds a scan": "ms per scan",
     "with 95 %": "95 % interval",
+    "(check|several|these) stretch(es)?": "segments",
 }
 
 

@@ -108,10 +108,10 @@ def test_rpe_over_frames_equals_evo(each, frames):
 def test_rpe_over_distance_and_time_equals_evo_on_the_same_stretches(each, measure):
     metrics, lie_algebra = (pytest.importorskip(f"evo.core.{name}") for name in ("metrics", "lie_algebra"))
     ours = measure[0](each, measure[1])
-    assert len(ours.stretches) > 15
+    assert len(ours.segments) > 15
     theirs = [
         metrics.RPE.rpe_base(each.reference[i], each.reference[j], each.estimate[i], each.estimate[j])
-        for i, j in ours.stretches
+        for i, j in ours.segments
     ]
     np.testing.assert_allclose(ours.errors_m, [np.linalg.norm(error[:3, 3]) for error in theirs], atol=1e-9)
     turns = [lie_algebra.so3_log_angle(error[:3, :3]) for error in theirs]
@@ -129,13 +129,13 @@ def test_where_the_rest_is_straight_the_start_alone_has_no_error_of_the_rest():
 
 def test_stretches_end_at_the_first_pose_far_or_late_enough(pairs):
     path = naive.traveled(pairs.reference)
-    stretches = ev.relative_error_over_distance(pairs, 20.0).stretches
-    assert len(stretches) > 10
-    for i, j in stretches:
+    segments = ev.relative_error_over_distance(pairs, 20.0).segments
+    assert len(segments) > 10
+    for i, j in segments:
         assert path[j] - path[i] >= 20.0 - 1e-9 > path[j - 1] - path[i] - 2e-9
-    stretches = ev.relative_error_over_time(pairs, 0.95).stretches
-    np.testing.assert_array_equal(stretches[:, 1] - stretches[:, 0], 10)
-    assert len(stretches) == len(pairs) - 10
+    segments = ev.relative_error_over_time(pairs, 0.95).segments
+    np.testing.assert_array_equal(segments[:, 1] - segments[:, 0], 10)
+    assert len(segments) == len(pairs) - 10
 
 
 @pytest.mark.parametrize("every", [1, 10])
@@ -143,7 +143,7 @@ def test_kitti_metric_equals_naive(each, every):
     lengths_m = (10.0, 20.0, 100.0)
     ours = ev.kitti_error(each, lengths_m, every=every)
     shares, turns = naive.kitti(each.reference, each.estimate, lengths_m, every)
-    assert ours.stretches == len(shares) == sum(part.stretches for part in ours.by_length)
+    assert ours.segments == len(shares) == sum(part.segments for part in ours.by_length)
     assert ours.translation_share == pytest.approx(np.mean(shares), abs=1e-12)
     assert ours.rotation_rad_per_m == pytest.approx(np.mean(turns), abs=1e-9)
 
@@ -166,7 +166,7 @@ def test_short_paths_are_judged_over_short_lengths(pairs):
     error = ev.kitti_error_of_any_path(pairs)
     assert error == ev.kitti_error(pairs)
     assert [part.length_m for part in error.by_length] == [100.0 * k for k in range(1, 9)]
-    assert [part.stretches > 0 for part in error.by_length] == [True, True] + [False] * 6
+    assert [part.segments > 0 for part in error.by_length] == [True, True] + [False] * 6
     assert [part.translation_share is not None for part in error.by_length] == [True, True] + [False] * 6
 
 
@@ -319,7 +319,7 @@ def test_stretches_that_do_not_fit_or_cross_a_gap_are_none_of_the_size_asked_for
     holed = np.delete(np.arange(100), range(40, 80))
     pairs = ev.pair(Trajectory(drive(100).stamps_ns[holed], drive(100).poses[holed]), drive(100))
     found = ev.relative_error_over_time(pairs, 1.0)
-    assert np.diff(pairs.stamps_ns[found.stretches], axis=1).max() == 10**9
+    assert np.diff(pairs.stamps_ns[found.segments], axis=1).max() == 10**9
 
 
 def test_a_kitti_file_gives_the_k_th_scan_its_k_th_row_and_must_have_as_many(tmp_path):

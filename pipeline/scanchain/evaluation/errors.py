@@ -246,11 +246,11 @@ class RelativeError(Metric):
 
     size : of the segments, in words
     translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
-    stretches : (M, 2) int64 indices i, j of the first and last pair of each segment
+    segments : (M, 2) int64 indices i, j of the first and last pair of each segment
     """
 
     size: str
-    stretches: NDArray[np.int64]
+    segments: NDArray[np.int64]
 
     @property
     def summary(self) -> str:
@@ -295,24 +295,24 @@ def _relative_error(pairs: Pairs, along: Floats | NDArray[np.int64], size: float
         raise InputError(
             f"RPE over {words}: no segment of that length fits into {counted(len(pairs), 'paired pose')}"
         )
-    stretches = np.stack([start, end[start]], axis=1)
-    errors_m, errors_rad = _motion_errors(pairs, stretches)
+    segments = np.stack([start, end[start]], axis=1)
+    errors_m, errors_rad = _motion_errors(pairs, segments)
     return RelativeError(
         size=words,
         definition=(
             f"RPE: translation and angle of (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) over {words}, from every start, "
-            f"{counted(len(stretches), 'segment')}"
+            f"{counted(len(segments), 'segment')}"
         ),
         pairing=pairs.description,
-        stretches=stretches,
+        segments=segments,
         errors_m=errors_m,
         errors_rad=errors_rad,
     )
 
 
-def _motion_errors(pairs: Pairs, stretches: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def _motion_errors(pairs: Pairs, segments: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Translation (M,) and angle (M,) of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) of each segment (i, j)."""
-    i, j = stretches[:, 0], stretches[:, 1]
+    i, j = segments[:, 0], segments[:, 1]
     reference = lie.between(pairs.reference[i], pairs.reference[j])
     estimate = lie.between(pairs.estimate[i], pairs.estimate[j])
     return _sizes(lie.between(reference, estimate))
@@ -328,7 +328,7 @@ class LengthError:
     """Mean drift over the segments of one length; None where none fits."""
 
     length_m: float
-    stretches: int
+    segments: int
     translation_share: float | None
     rotation_rad_per_m: float | None
 
@@ -339,7 +339,7 @@ class KittiError:
 
     translation_share : ‖t‖ / length; times 100 it is the published per cent
     rotation_rad_per_m : angle / length
-    stretches : number of segments, in all and in ``by_length``
+    segments : number of segments, in all and in ``by_length``
     """
 
     __repr__ = brief
@@ -347,7 +347,7 @@ class KittiError:
     pairing: str
     translation_share: float
     rotation_rad_per_m: float
-    stretches: int
+    segments: int
     by_length: tuple[LengthError, ...]
 
     @property
@@ -355,7 +355,7 @@ class KittiError:
         """The figures in one line, in the units they are published in."""
         return (
             f"KITTI translation {100.0 * self.translation_share:.4f} %, rotation "
-            f"{np.degrees(self.rotation_rad_per_m):.6f} deg/m over {counted(self.stretches, 'segment')}"
+            f"{np.degrees(self.rotation_rad_per_m):.6f} deg/m over {counted(self.segments, 'segment')}"
         )
 
 
@@ -392,7 +392,7 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
         pairing=pairs.description,
         translation_share=float(share.mean()),
         rotation_rad_per_m=float(turn.mean()),
-        stretches=len(share),
+        segments=len(share),
         by_length=tuple(by_length),
     )
 
