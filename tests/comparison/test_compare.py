@@ -217,7 +217,7 @@ def test_a_verdict_fails_nothing_and_a_method_that_did_not_finish_does(office, g
     crashed = msgspec.structs.replace(table.rows[0], status=Status.CRASHED)
     for first, code in ((doubted, 0), (crashed, 1)):
         compared = Compared(folder, msgspec.structs.replace(table, rows=[first, *table.rows[1:]]))
-        monkeypatch.setattr("scanchain.comparison.compare.compare", lambda *_, done=compared: done)
+        monkeypatch.setattr("scanchain.comparison.compare.compare", lambda *_, done=compared, **__: done)
         assert main(["compare", str(office), "--out", str(folder)]) == code
     output = capfd.readouterr()
     assert output.err == "error: did not finish: plicp; see the table for the reason\n"
