@@ -241,8 +241,8 @@ class PoseGraph:
         whole = of_residuals(information, self.freedom, factor)
         edge = np.array([pair], np.int64), Z[None], whole[None]
         check_edges(*edge, len(self), with_origin=True)
-        T_i = lie.identity(self.dimension) if i == ORIGIN else self.poses[i]
-        factor.check(lie.between(T_i, self.poses[j]), Z, len(np.asarray(information)))
+        T_i, T_j = self.poses[[i, j]]  # copies
+        factor.check(T_j if i == ORIGIN else lie.between(T_i, T_j), Z, len(np.asarray(information)))
         known = (
             kind
             for kind, each in enumerate(self._factors)
