@@ -34,7 +34,7 @@ def held(found, positions_m, **noise):
         stands.append(found.confirms(match))
         x.append((found.T_odom_lidar if stands[-1] else match.T_target_source)[0, -1])
         if not stands[-1]:
-            found.follow(match)
+            found.update(match)
     return np.array(x), np.array(stands)
 
 

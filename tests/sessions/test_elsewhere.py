@@ -96,7 +96,7 @@ def test_where_nobody_was_a_grid_is_not_seen_from(tmp_path):
     ("name", "text", "message"),
     [
         ("m.txt", "", "is no map that can be read"),
-        ("m.ply", "no ply", "is no PLY"),
+        ("m.ply", "no ply", "is not a PLY file"),
         ("m.laz", "no laz", "no LAS or LAZ file"),
         ("m.yaml", "image: [", "no map of map_server"),
         ("m.yaml", "image: none.pgm\nresolution: 1", "cannot be read"),
