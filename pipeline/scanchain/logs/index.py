@@ -98,7 +98,8 @@ class FileIndex:
 
     number : its index among the files of the log
     data : its bytes, if blocks are ranges of them; ``fetch`` reads those of a remote file, by offset and size
-    contents : contents of a block, at least for the channels wanted, None for all; set by its format
+    contents : contents of a block of the index, at least for the channels wanted, None for all; set by its format
+        without a reference to the index, which would keep the file open
     schemas : name, language and definition by schema id, in MCAP
     channels, counts : channels, and number of messages, by channel id; counts are empty until they are known
     is_consistent : whether the channels stated by blocks were checked
@@ -110,7 +111,7 @@ class FileIndex:
     number: int
     data: mmap.mmap | bytes = b""
     fetch: Callable[[int, int], bytes] | None = None
-    contents: Callable[[Block, AbstractSet[int] | None], Contents] = field(init=False)
+    contents: Callable[[FileIndex, Block, AbstractSet[int] | None], Contents] = field(init=False)
     blocks: list[Block] = field(default_factory=list)
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -172,7 +173,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
 
     Raises DamagedBlockError if a complete block does not decompress to what its header states.
     """
-    messages, damage = index.contents(block, wanted)
+    messages, damage = index.contents(index, block, wanted)
     messages = [each for each in messages if wanted is None or each.channel.key[1] in wanted]
     if index.begin_ns:
         messages = [each._replace(log_time_ns=each.log_time_ns or index.begin_ns) for each in messages]

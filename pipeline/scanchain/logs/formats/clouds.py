@@ -250,7 +250,7 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
     for place, (size, stamp_ns) in enumerate(zip(sizes, stamps_ns, strict=True)):
         add_block(index, place, size, [stamp_ns], {channel: 1})
 
-    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
+    def make(_: FileIndex, block: Block, wanted: AbstractSet[int] | None) -> Contents:
         return contents_of(files[block.offset], channel, block.start_ns, lambda file: read_cloud_file(file, raw))
 
     index.contents = make

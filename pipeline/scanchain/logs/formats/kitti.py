@@ -95,7 +95,7 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
         poses = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
         add_block(index, _TRUTH, 720 * len(truth), [each for each, _ in truth], {poses: len(truth)})
 
-    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
+    def make(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Contents:
         channel = index.channels[next(iter(block.counts))]
         if block.offset == _TRUTH:
             packed = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]

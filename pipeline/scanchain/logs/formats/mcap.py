@@ -16,7 +16,7 @@ from collections.abc import Callable
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -96,7 +96,7 @@ def empty_index(
 ) -> FileIndex:
     """Index of an MCAP file to which no record has been added yet."""
     index = FileIndex(path, number, data, fetch)
-    index.contents = partial(contents, index)
+    index.contents = contents
     return index
 
 

@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -151,7 +150,7 @@ def index_ros1_bag(path: Path, number: int, _: LogConfig) -> FileIndex:
             raise InputError(f"{path}: is a bag of an old version; convert it with rosbag migrate")
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     index = FileIndex(path, number, data)
-    index.contents = partial(_contents, index)
+    index.contents = _contents
     head = read_record(data, len(MAGIC))
     if head is not None and head.text(b"encryptor"):
         raise InputError(f"{path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")

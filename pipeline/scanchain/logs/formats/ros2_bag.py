@@ -82,7 +82,7 @@ def index_ros2_bag(path: Path, number: int, _: LogConfig) -> FileIndex:
             index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
         if not reader.start_time:  # messages of log time 0, which are in the first block
             index.blocks[0] = replace(index.blocks[0], start_ns=0)
-    index.contents = partial(bag.contents, index)
+    index.contents = bag.contents
     return index
 
 
