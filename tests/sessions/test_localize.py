@@ -181,7 +181,7 @@ def test_the_verdict_names_what_speaks_for_the_place(office, monkeypatch):
         ),
         (["--out", "OUT", "--loops.enabled=false"], "localization in a map needs loop closures; leave it true"),
         (["--out", "MAP", "--force"], "is one of the maps; choose another --out"),
-        (["--out", "MAP/map", "--force"], "is one of the maps; choose another --out"),
+        (["--out", "MAP/map", "--force"], "lies in the run directory"),
     ],
 )
 def test_what_cannot_be_localized_is_refused_and_leaves_the_map_as_it_was(office, tmp_path, call, words, message):
