@@ -55,7 +55,8 @@ class Program:
             process = subprocess.Popen(command, env=os.environ | own, cwd="/", stdout=said, stderr=said)
             _, status, usage = os.wait4(process.pid, 0)
             said.seek(0)
-            if os.waitstatus_to_exitcode(status) not in (0, 1) or "error:" in (text := said.read().lower()):
+            text = said.read().lower()
+            if os.waitstatus_to_exitcode(status) not in (0, 1) or "error:" in text:
                 sys.exit(f"{' '.join(command)}\n{text}")  # 1: not trustworthy
         return usage.ru_utime + usage.ru_stime, perf_counter() - began, usage.ru_maxrss / 1024
 
