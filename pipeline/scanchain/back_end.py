@@ -114,7 +114,7 @@ class BackEnd:
         return Constraint(Odometry(), self.first - 1, Z, information)
 
     def replace_points(self, number: int, stored: KeyframePoints) -> None:
-        """Replace the points of a keyframe, which were deskewed anew."""
+        """Replace the points of a keyframe, which were deskewed again."""
         self.keyframes[number] = replace(self.keyframes[number], stored=stored)
 
     def advance(self, *, is_keyframe: bool) -> tuple[tuple[Closure, ...], GraphState | None]:

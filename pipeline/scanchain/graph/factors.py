@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scanchain import checks, lie
 from scanchain.data import Integers, Mask, Matrix, Pose
 from scanchain.errors import InputError
+from scanchain.graph.growing_array import read_only
 from scanchain.kernels.graph import between
 
 ORIGIN = -1  # index i of a unary edge: the origin of the world, which is fixed
@@ -221,10 +220,3 @@ def turns(positions: Matrix) -> Matrix:
     if positions.shape[1] == 3:
         return -lie.hat(positions)
     return np.stack([-positions[:, 1], positions[:, 0]], axis=1)[..., None]
-
-
-def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """A read-only view, so that a kernel is compiled for one kind of array only."""
-    view = array.view()
-    view.flags.writeable = False
-    return view

@@ -9,6 +9,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A read-only view, so that a kernel is compiled for one kind of array only."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 class GrowingArray:
     """Rows of one shape and type; the capacity doubles when it is full."""
 
@@ -37,9 +44,7 @@ class GrowingArray:
     @property
     def rows(self) -> NDArray[Any]:
         """View of the rows, (n, ...), not to be written to."""
-        view = self._room[: self._count]
-        view.flags.writeable = False
-        return view
+        return read_only(self._room[: self._count])
 
     def replace(self, rows: NDArray[Any]) -> None:
         """Replace all rows by these; views returned before keep the old ones."""

@@ -11,7 +11,8 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
-from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, SIGHTINGS, WHOLE, Factor, kinds_of, read_only
+from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, SIGHTINGS, WHOLE, Factor, kinds_of
+from scanchain.graph.growing_array import read_only
 from scanchain.kernels.graph import between
 
 

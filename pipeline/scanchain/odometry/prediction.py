@@ -32,7 +32,7 @@ _MOST_DOUBTFUL = 0.5  # share of lost or contradicted scans, above which scans c
 
 
 class Source(StrEnum):
-    """What predicts the motion to a scan."""
+    """Source of the predicted motion to a scan."""
 
     CONSTANT_VELOCITY = "constant velocity"
     WHEELS = "wheels"

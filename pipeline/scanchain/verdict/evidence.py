@@ -1,4 +1,4 @@
-"""What is known about a trajectory scan by scan, the findings of its checks, and the base class of a check."""
+"""Evidence on a trajectory per scan, the findings of its checks, and the base class of a check."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Closures:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What is known about a trajectory, mostly (N,) arrays with a value per scan.
+    """Evidence on a trajectory, mostly (N,) arrays with a value per scan.
 
     stamps_ns, log_times_ns : of the scans
     poses : (N, d+1, d+1) final

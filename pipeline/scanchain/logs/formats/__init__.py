@@ -1,4 +1,4 @@
-"""What a log format declares, and helpers for formats whose messages are made on reading."""
+"""Declaration of a log format, and functions for formats whose messages are made on reading."""
 
 from __future__ import annotations
 
