@@ -10,6 +10,7 @@ Whole numbers agree exactly, others within one unit of the last digit shown.
 
 import ast
 import json
+import os
 import re
 import shlex
 import shutil
@@ -99,8 +100,9 @@ def run_console(text, name, capsys):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty folder to work in, in which this process and those it starts find modules."""
+    """An empty folder to work in, in which this process and those it starts find modules, and the command."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     return tmp_path
