@@ -8,7 +8,7 @@ coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist h
 from __future__ import annotations
 
 import math
-from collections.abc import Sized
+from collections.abc import Iterator, Sized
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, NamedTuple, Protocol
@@ -58,10 +58,29 @@ def _brief(value: object) -> str:
 
 
 class OtherPoints(NamedTuple):
-    """Points (N, d) of other lidars in the frame of a scan, and their times (N,), seconds after its stamp."""
+    """Points (N, d) of another lidar in the frame of a scan, and where it is in that frame.
+
+    times_s : (N,) seconds after the scan's stamp
+    origin : (d,) meters
+    """
 
     points: RawPoints
     times_s: NDArray[np.float32]
+    origin: Vector
+
+
+class RaySpan(NamedTuple):
+    """Consecutive points of a scan that one lidar measured: a number of rays from its ``origin`` (d,), meters."""
+
+    origin: Vector
+    rays: int
+
+    @staticmethod
+    def among(spans: tuple[RaySpan, ...], chosen: NDArray[np.integer]) -> tuple[RaySpan, ...]:
+        """The spans of chosen points, whose numbers (M,) ascend."""
+        ends = np.searchsorted(chosen, np.cumsum([span.rays for span in spans]))
+        rays = np.diff(ends, prepend=0).tolist()
+        return tuple(RaySpan(span.origin, count) for span, count in zip(spans, rays, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +97,8 @@ class Scan:
     waited_s : seconds that the reader of the log made its consumer wait for this scan
     is_copy : whether its points are bitwise equal to those of the previous scan in the log
     clock_jump_s : jump of the stamp since the previous scan for which no time passed; usually 0
-    others : points of other lidars that publish on the topic, measured just before; usually None
+    others : points of other lidars that publish on the topic, measured just before; usually none
+    origin : (d,) meters, where the lidar is in the frame of its points; None where it is the origin of that frame
 
     Arrays are converted if nothing is lost; any other shape, dtype or value raises InputError.
     """
@@ -94,7 +114,8 @@ class Scan:
     waited_s: float = 0.0
     is_copy: bool = False
     clock_jump_s: float = 0.0
-    others: OtherPoints | None = None
+    others: tuple[OtherPoints, ...] = ()
+    origin: Vector | None = None
 
     def __post_init__(self) -> None:
         """Check and convert; the class is frozen, so that the checks stay valid."""
@@ -106,6 +127,8 @@ class Scan:
         points = checks.points(self.points, "points", d, dtype=np.float32)
         _set(self, "points", points)
         _set(self, "times_s", checks.point_times(self.times_s, "times_s", len(points)))
+        if self.origin is not None:
+            _set(self, "origin", checks.matrices(self.origin, "origin", (d,)))
         if self.T_odom_base is not None:
             _set(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
 
@@ -263,6 +286,11 @@ class KeyframeErrors(NamedTuple):
 class KeyframePoints(Protocol):
     """Points of a keyframe that lie on disk."""
 
+    @property
+    def spans(self) -> tuple[RaySpan, ...]:
+        """Origins of their rays; () where all start at the origin of the keyframe's frame."""
+        ...
+
     def read(self) -> Points:
         """(M, d) meters."""
         ...
@@ -296,6 +324,20 @@ class Keyframe:
     def points(self) -> Points:
         """(M, d) deskewed points, lidar frame; read from disk each time."""
         return self.stored.read()
+
+    def views(self, T_frame_lidar: Pose) -> Iterator[tuple[Pose, Points]]:
+        """The points by the lidar that measured them: pose of its origin in a frame, and points (M, d) from there.
+
+        T_frame_lidar : pose of the keyframe in that frame
+        """
+        points, start = self.points, 0
+        if not self.stored.spans:
+            yield T_frame_lidar, points
+        for origin, rays in self.stored.spans:
+            T_frame_origin = T_frame_lidar.copy()
+            T_frame_origin[:-1, -1] += T_frame_lidar[:-1, :-1] @ origin
+            yield T_frame_origin, points[start : start + rays] - origin
+            start += rays
 
 
 class Problem(NamedTuple):

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.data import RaySpan
 from scanchain.errors import InputError
 
 _NUMBER = np.dtype("<f4")  # as lidars give them
@@ -37,9 +38,9 @@ class PointStore:
         self.crc = 0
         self._take(_nameless() if path is None else path.open("w+b", buffering=0))
 
-    def add(self, points: NDArray[np.floating]) -> StoredPoints:
+    def add(self, points: NDArray[np.floating], spans: tuple[RaySpan, ...] = ()) -> StoredPoints:
         """Append points (N, d), meters. Raises OSError where the disk is full."""
-        stored = StoredPoints(self, self.rows, len(points))
+        stored = StoredPoints(self, self.rows, len(points), spans)
         self.waiting += points.astype(_NUMBER).tobytes()
         self.rows += len(points)
         if len(self.waiting) >= _MOST_WAITING:
@@ -104,11 +105,12 @@ class PointStore:
 
 @dataclass(frozen=True, slots=True)
 class StoredPoints:
-    """The points of one scan, ``count`` rows of a store from the ``first`` on."""
+    """The points of one scan, ``count`` rows of a store from the ``first`` on, and the origins of their rays."""
 
     store: PointStore
     first: int
     count: int
+    spans: tuple[RaySpan, ...] = ()
 
     def read(self) -> NDArray[np.float64]:
         """(count, d) meters."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import PreprocessConfig
-from scanchain.data import Points, Pose, Scan
+from scanchain.data import Points, Pose, RaySpan, Scan
 from scanchain.kernels import scans as kernels
 from scanchain.range_noise import RangeNoise
 
@@ -59,11 +59,13 @@ class Sweep:
     points : (M, d) float64 meters, each in the lidar frame of its own instant
     times_s : (M,) seconds after the middle of the scan; (0,) where all are taken as simultaneous
     middle_s : seconds from the scan's stamp to its middle
+    spans : origins of the rays; () where all start at the origin of the frame
     """
 
     points: Points
     times_s: NDArray[np.float64]
     middle_s: float
+    spans: tuple[RaySpan, ...] = ()
 
     @property
     def is_distorted(self) -> bool:
@@ -79,7 +81,8 @@ class Sweep:
         """The first point of every voxel of this size."""
         chosen = first_per_voxel(self.points, voxel_m, 0.0, np.inf)
         times_s = self.times_s[chosen] if self.is_distorted else self.times_s
-        return Sweep(self.points.take(chosen, axis=0), times_s, self.middle_s)
+        spans = RaySpan.among(self.spans, chosen)
+        return Sweep(self.points.take(chosen, axis=0), times_s, self.middle_s, spans)
 
     def from_middle(self, motion: ScanMotion) -> Points:
         """The points (M, d) deskewed to the lidar's pose in the middle of the scan.
@@ -102,15 +105,20 @@ def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
     """
     voxel_m = scale * config.map_voxel_m
     raw, times_s = scan.points, scan.times_s if config.deskew else scan.times_s[:0]
-    if scan.others is not None:  # as if one lidar had seen it all
+    spans: tuple[RaySpan, ...] = ()
+    if scan.others or scan.origin is not None:
+        origin = np.zeros(raw.shape[1]) if scan.origin is None else scan.origin
+        spans = tuple(RaySpan(each, len(points)) for points, _, each in ((raw, times_s, origin), *scan.others))
+    if scan.others:
         times_s = times_s if len(times_s) else np.zeros(len(raw), np.float32)
-        raw, times_s = np.concatenate([raw, scan.others.points]), np.concatenate([times_s, scan.others.times_s])
+        raw = np.concatenate([raw, *(each.points for each in scan.others)])
+        times_s = np.concatenate([times_s, *(each.times_s for each in scan.others)])
     chosen = first_per_voxel(raw, voxel_m, config.min_range_m, config.max_range_m)
-    points = raw.take(chosen, axis=0).astype(np.float64)
+    points, spans = raw.take(chosen, axis=0).astype(np.float64), RaySpan.among(spans, chosen)
     if not len(times_s):
-        return Sweep(points, np.empty(0), 0.0)
+        return Sweep(points, np.empty(0), 0.0, spans)
     middle_s = 0.5 * (float(times_s.min()) + float(times_s.max()))
-    return Sweep(points, times_s[chosen].astype(np.float64) - middle_s, middle_s)
+    return Sweep(points, times_s[chosen].astype(np.float64) - middle_s, middle_s, spans)
 
 
 def downsample(points: Points, voxel_m: float) -> Points:

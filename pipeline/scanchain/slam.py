@@ -22,6 +22,7 @@ from scanchain.data import (
     Matrix,
     Points,
     Pose,
+    RaySpan,
     Scan,
     Step,
     Timing,
@@ -236,10 +237,11 @@ class Slam:
             self.traveled_m += lie.apart(self.steps.columns["T_odom_lidar"][-1], tracked.T_odom_lidar)[0]
         if number == 1:  # only now is the motion known that distorted the first scan
             self.spans.replace(np.empty((0, 2)))
-            back_end.replace_points(back_end.first, self._stored(located.first_points))
+            first = self.keyframes[back_end.first].stored
+            back_end.replace_points(back_end.first, self._stored(located.first_points, first.spans))
         if not located.is_keyframe and not self._refines:
             return False
-        stored = self._stored(tracked.points)
+        stored = self._stored(tracked.points, tracked.spans)
         if not located.is_keyframe:
             return False
         keyframe = Keyframe(
@@ -259,9 +261,9 @@ class Slam:
         back_end.add(keyframe, motion, located.errors, starts_segment=tracked.elsewhere_m > 0.0)
         return True
 
-    def _stored(self, points: Points) -> StoredPoints:
+    def _stored(self, points: Points, spans: tuple[RaySpan, ...]) -> StoredPoints:
         """Points (M, d) of the newest scan, stored in the file."""
-        stored = self.points.add(points)
+        stored = self.points.add(points, spans)
         self.spans.append((stored.first, stored.count))
         return stored
 

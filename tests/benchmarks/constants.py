@@ -1,11 +1,13 @@
 """Constants of the product: how many there are, and which change nothing at half and at double their value.
 
-    python -m tests.benchmarks.constants [--room ROOM ...] [--count]
+    python -m tests.benchmarks.constants [--room ROOM ...] [--count] [--workers N]
 
 A constant is a name in module scope bound to a number, or to a tuple or dictionary of numbers. Each is set to half
-and to double its value in every module that holds it, and the cases below run again; their results are compared
-to the bit. ROOM limits this to constants of files whose path contains it. Constants of kernels are compiled in and
-are only counted; those from which others are computed on import show as "nothing".
+and to double its value in every module that holds it, and those of the cases below that call a function which
+reads it run again, the quick ones first, until the result of one differs in a bit. The table says which,
+"nothing" where all are the same, and "not reached" where no case calls such a function. ROOM limits this to
+constants of files whose path contains it. Constants of kernels are compiled in, and others are read while modules
+are imported: both are only counted.
 """
 
 from __future__ import annotations
@@ -14,24 +16,37 @@ import ast
 import hashlib
 import importlib
 import sys
+import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from itertools import islice
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import CodeType, FrameType
 from typing import Any, NamedTuple
 
 import numpy as np
+from click.testing import CliRunner
 
 import scanchain
+from scanchain.commands.landmarks import landmarks
 from scanchain.commands.logs import doctor
-from scanchain.slam import SlamResult
-from tests.benchmarks.harness import options_of, table
+from scanchain.data import Matrix, Scan
+from scanchain.sessions.elsewhere import import_map
+from scanchain.settings import overrides_of
+from scanchain.simulation import WORLDS
+from tests.benchmarks.harness import CACHE, drive_of, options_of, table
+from tests.support import made
 from tests.support.scenes import DATA, ROOT
 
 PACKAGES = {"pipeline": "scanchain", "viz": "scanchain_viz"}
+FOLDERS = tuple(str(ROOT / folder) for folder in PACKAGES)
 FACTORS = (0.5, 2.0)
+Case = Callable[[Path], bytes]
 
 
 class Constant(NamedTuple):
@@ -119,83 +134,38 @@ class Changed:
             setattr(module, self.constant.name, self.constant.value)
 
 
-def result_of(name: str, scans: int, **options: object) -> SlamResult:
-    """SLAM on the first scans of a log of ../shared/data."""
-    log = scanchain.open_log(DATA / name)
-    slam = scanchain.Slam(scanchain.load_settings(log.dimension, overrides=options).config, log.stated_mounting)
-    for scan in islice(log, scans):
-        slam.process(scan)
-    return slam.finish()
+def reading(code: CodeType) -> Iterator[str]:
+    """Names that a function or one defined in it reads from its module."""
+    yield from code.co_names
+    for each in code.co_consts:
+        if isinstance(each, CodeType):
+            yield from reading(each)
 
 
-def of_slam(name: str, scans: int, **options: object) -> bytes:
-    """Trajectories, graph, closures and verdict."""
-    result = result_of(name, scans, **options)
-    judged = scanchain.judge(result)
-    arrays = (result.trajectory.poses, result.odometry.poses, result.state.poses, result.graph.information)
-    words = (judged.sentence, [(each.target, each.source, each.reason) for each in result.closures])
-    return b"".join(np.ascontiguousarray(each).tobytes() for each in arrays) + repr(words).encode()
+def readers(constant: Constant, called: Iterable[tuple[str, str]]) -> bool:
+    """True if one of the functions called (file, name read) reads a constant."""
+    if constant.name.startswith("_"):
+        return (str(ROOT / constant.path), constant.name) in called
+    return any(name == constant.name for _, name in called)
 
 
-def of_directory(folder: Path) -> bytes:
-    """The files of a result that have no times in them."""
-    names = ("*.tum", "*.g2o", "map.ply", "map.pgm")
-    return b"".join(path.read_bytes() for name in names for path in sorted(folder.glob(name)))
+def reached(case: Case) -> frozenset[tuple[str, str]]:
+    """Files of the functions that a case calls, each with the names that it reads."""
+    codes: set[CodeType] = set()
 
+    def profile(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            codes.add(frame.f_code)
 
-def of_sessions(folder: Path) -> bytes:
-    """Two parts of Intel: a run each, one localized in the other's map, both merged."""
-    options = {"recording": False, "outputs__error_bars": "quick"}
-    log = DATA / "2d/intel.mcap"
-    one, other = (
-        scanchain.run(log, folder / name, log__start_s=start, log__end_s=start + 60.0, **options).path
-        for name, start in (("one", 0.0), ("other", 60.0))
-    )
-    found = scanchain.localize(log, one, folder / "found", recording=False, log__start_s=20.0, log__end_s=60.0)
-    merged = scanchain.merge([one, other], folder / "merged")
-    return b"".join(map(of_directory, (one, other, found.path, merged.path)))
-
-
-def of_doctor(folder: Path) -> bytes:
-    """What doctor says of logs that are easily misread."""
-    from click.testing import CliRunner
-
-    logs = sorted(path for path in (DATA / "reports").iterdir() if path.suffix in (".mcap", ".bag", ".db3"))
-    return "".join(CliRunner().invoke(doctor, [str(log)]).output for log in logs).encode()
-
-
-def of_graphs(folder: Path) -> bytes:
-    """A published graph, with and without a robust loss, certified."""
-    text = b""
-    for robust in ("none", "truncated"):
-        graph = scanchain.read_g2o(DATA / "graphs/MIT.g2o").graph
-        scanchain.optimize(graph, robust=robust)
-        text += graph.poses.tobytes() + graph.weight.tobytes() + graph.certify().verdict.encode()
-    return text
-
-
-def of_simulation(folder: Path) -> bytes:
-    """Short simulated logs."""
-    for world, options in (("office", {}), ("town", {}), ("office", {"changed": 1})):
-        scanchain.simulate(world, folder / f"{world}{len(options)}.mcap", duration_s=3.0, **options)
-    return b"".join(path.read_bytes() for path in sorted(folder.glob("*.mcap")))
-
-
-Case = Callable[[Path], bytes]
-SLAM: dict[str, Case] = {
-    "csail": lambda folder: of_slam("2d/mit_csail.mcap", 400),
-    "mocap": lambda folder: of_slam("2d/mocap_room_1.bag", 150),
-    "kitti": lambda folder: of_slam("3d/kitti_0005_first60.mcap", 25),
-}
-CASES: dict[str, dict[str, Case]] = {  # by what the path of a constant contains; the first that does
-    "/kernels/": {},
-    "scanchain_viz": {},
-    "/simulation/": {"simulate": of_simulation},
-    "/logs/": {"doctor": of_doctor} | SLAM,
-    "/sessions/": {"sessions": of_sessions},
-    "/graph/": {"graph": of_graphs} | SLAM,
-    "": SLAM | {"sessions": of_sessions},
-}
+    threading.setprofile(profile)
+    sys.setprofile(profile)
+    try:
+        digest(case)
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)  # type: ignore[arg-type]  # as documented
+    ours = [code for code in codes if code.co_filename.startswith(FOLDERS)]
+    return frozenset((code.co_filename, name) for code in ours for name in reading(code))
 
 
 def digest(case: Case) -> str:
@@ -207,27 +177,176 @@ def digest(case: Case) -> str:
             return type(error).__name__
 
 
+@cache
+def usual(name: str) -> tuple[str, frozenset[tuple[str, str]], float]:
+    """The result of a case as it is, what it reads, and how long it takes in seconds."""
+    called = reached(CASES[name])
+    started = time.perf_counter()
+    return digest(CASES[name]), called, time.perf_counter() - started
+
+
+def tried(constant: Constant) -> str:
+    """What the first case says whose result differs with another value."""
+    cases = sorted((name for name in CASES if readers(constant, usual(name)[1])), key=lambda name: usual(name)[2])
+    for name in cases:
+        for factor in FACTORS:
+            with Changed(constant, factor):
+                if digest(CASES[name]) != usual(name)[0]:
+                    return f"{name} at {factor:g}"
+    return f"nothing ({', '.join(cases)})" if cases else "not reached"
+
+
+def slam_of(scans: Iterable[Scan], dimension: int, mounting: Matrix | None = None, **options: object) -> bytes:
+    """Trajectories, graph, closures and verdict."""
+    config = scanchain.load_settings(dimension, overrides=overrides_of(options)).config
+    slam = scanchain.Slam(config, mounting, dimension=dimension)
+    for scan in scans:
+        slam.process(scan)
+    result = slam.finish()
+    judged = scanchain.judge(result)
+    arrays = (result.trajectory.poses, result.odometry.poses, result.state.poses, result.graph.information)
+    words = (judged.sentence, [(each.target, each.source, each.reason) for each in result.closures])
+    return b"".join(np.ascontiguousarray(each).tobytes() for each in arrays) + repr(words).encode()
+
+
+def of_log(name: str, scans: int, left_out: range = range(0), topic: str = "", **options: object) -> Case:
+    """SLAM on the first scans of a log of ../shared/data, but for those left out."""
+
+    def case(folder: Path) -> bytes:
+        log = scanchain.open_log(DATA / name, topic=topic)
+        chosen = (scan for k, scan in enumerate(islice(log, scans)) if k not in left_out)
+        return slam_of(chosen, log.dimension, log.stated_mounting, **options)
+
+    return case
+
+
+def of_world(world: str, sensor: str, scans: int, every: int = 1) -> Case:
+    """SLAM on every n-th of the first scans of a simulated drive."""
+
+    def case(folder: Path) -> bytes:
+        log = scanchain.open_log(drive_of(world, sensor, scans, CACHE), every=every)
+        return slam_of(log, log.dimension)
+
+    return case
+
+
+def of_standing(folder: Path) -> bytes:
+    """A lidar that stands for 5 s, moves on for 2 s, and stands again; in each scan a part of the points."""
+    scans = list(islice(scanchain.open_log(DATA / "3d/kitti_0005_first60.mcap"), 20))
+    shown = [0] * 50 + list(range(20)) + [19] * 40
+    chosen = np.random.default_rng(0)
+
+    def taken(k: int, scan: Scan) -> Scan:
+        points = scan.points[chosen.random(len(scan.points)) < 0.2]
+        return Scan.of(points + chosen.normal(0.0, 0.01, points.shape), 0.1 * k)
+
+    return slam_of((taken(k, scans[number]) for k, number in enumerate(shown)), 3)
+
+
+def of_directory(folder: Path) -> bytes:
+    """The files of a result that have no times in them."""
+    names = ("*.tum", "*.g2o", "map.ply", "map.pgm", "*.csv")
+    return b"".join(path.read_bytes() for name in names for path in sorted(folder.glob(name)))
+
+
+def of_sessions(folder: Path) -> bytes:
+    """An office on two days: a run each, one localized in maps of the other, both merged and compared."""
+    options = {"recording": False, "outputs__error_bars": "quick"}
+    logs = [
+        made.log("office", folder=CACHE, seconds=25.0),
+        made.log("office", folder=CACHE, seconds=24.0, changed=1),
+    ]
+    one, other = (scanchain.run(log, folder / f"run {k}", **options).path for k, log in enumerate(logs))
+    import_map(one / "map.yaml", folder / "imported")
+    maps = enumerate((one, folder / "imported"))
+    found = [scanchain.localize(logs[1], each, folder / f"found {k}", recording=False).path for k, each in maps]
+    merged = scanchain.merge([one, other], folder / "merged").path
+    scanchain.changes(one, other, folder / "changed")
+    return b"".join(map(of_directory, (one, other, *found, merged, folder / "changed")))
+
+
+def of_drive(folder: Path) -> bytes:
+    """A simulated drive with error bars, evaluated."""
+    log = drive_of("town", "vlp-16", 60, CACHE)
+    done = scanchain.run(log, folder / "run", recording=False)
+    return of_directory(done.path) + repr(scanchain.evaluate(done.path, log.with_suffix(".tum"))).encode()
+
+
+def of_doctor(folder: Path) -> bytes:
+    """What doctor says of logs that are easily misread."""
+    logs = sorted(path for path in (DATA / "reports").iterdir() if path.suffix in (".mcap", ".bag", ".db3"))
+    return "".join(CliRunner().invoke(doctor, [str(log)]).output for log in logs).encode()
+
+
+def of_graphs(folder: Path) -> bytes:
+    """Published graphs, with and without a robust loss, certified; with covariances."""
+    text = b""
+    for name in ("MIT", "smallGrid3D"):
+        for robust in ("none", "truncated"):
+            graph = scanchain.read_g2o(DATA / f"graphs/{name}.g2o").graph
+            scanchain.optimize(graph, robust=robust)
+            text += graph.poses.tobytes() + graph.weight.tobytes() + graph.certify().verdict.encode()
+    return text
+
+
+def of_landmarks(folder: Path) -> bytes:
+    """A log of ranges and bearings, and a problem far from its solution."""
+    for name, options in (("utias_mrclam6", ()), ("2d_nonlinear.npz", ("--guess", "disturbed"))):
+        words = [str(DATA / "landmarks" / name), "--out", str(folder / name), "--repeat", "1", *options]
+        CliRunner().invoke(landmarks, words, catch_exceptions=False)
+    return b"".join(of_directory(folder / name) for name in ("utias_mrclam6", "2d_nonlinear.npz"))
+
+
+def of_simulation(folder: Path) -> bytes:
+    """Short simulated logs."""
+    for world in WORLDS:
+        scanchain.simulate(
+            world, folder / f"{world}.mcap", duration_s=0.3, changed=int(world in ("office", "town"))
+        )
+    return b"".join(path.read_bytes() for path in sorted(folder.glob("*.mcap")))
+
+
+CASES: dict[str, Case] = {
+    "csail": of_log("2d/mit_csail.mcap", 400),
+    "intel": of_log("2d/intel.mcap", 700),
+    "mocap": of_log("2d/mocap_room_1.bag", 150),
+    "lost in a building": of_log("2d/mit_csail.mcap", 300, range(60, 120), odometry__prior="constant-velocity"),
+    "standing in a room": of_log("reports/rplidar_standing.bag", 100),
+    "kitti": of_log("3d/kitti_0005_first60.mcap", 12),
+    "svd-icp": of_log("3d/kitti_0001_first54.mcap", 8, matching__matcher="svd"),
+    "pandaset": of_log("3d/pandaset_002_sweeps30to55.mcap", 8, topic="/pandar64/points"),
+    "standing in a street": of_standing,
+    "loops": of_world("town", "vlp-16", 600, every=3),
+    "staircase": of_world("staircase", "vlp-16", 100),
+    "lost in a street": of_world("gap", "vlp-16", 220),
+    "corridor": of_world("corridor", "vlp-16", 80),
+    "rosette": of_world("turns", "rosette", 60),
+    "drive": of_drive,
+    "sessions": of_sessions,
+    "graphs": of_graphs,
+    "landmarks": of_landmarks,
+    "doctor": of_doctor,
+    "simulation": of_simulation,
+}
+
+
 def main() -> None:
-    arguments = options_of(__doc__, cache=False, room=[""], count=False)
+    arguments = options_of(__doc__, cache=False, room=[""], count=False, workers=1)
     names = Counter(each.name for each in constants())
     kernels = sum("/kernels/" in str(each.path) for each in constants())
     shared = sum(count > 1 for count in names.values())
     print(f"{len(constants())} constants, {kernels} of them in kernels; {shared} names in several files\n")
     if arguments.count:
         return
-    usual = cache(digest)
-    row = table("constant", "value", *(f"at {factor:g}" for factor in FACTORS))
-    for constant in constants():
-        cases = next(cases for part, cases in CASES.items() if part in f"/{constant.path}")
-        if not cases or not any(room in str(constant.path) for room in arguments.room):
-            continue
-        cells = []
-        for factor in FACTORS:
-            before = {name: usual(case) for name, case in cases.items()}
-            with Changed(constant, factor):
-                changed = [name for name, case in cases.items() if digest(case) != before[name]]
-            cells.append(", ".join(changed) or "nothing")
-        row(f"`{constant.module}.{constant.name}`", constant.value, *cells)
+    row = table("constant", "value", "changes")
+    chosen = [
+        each
+        for each in constants()
+        if "/kernels/" not in str(each.path) and any(room in str(each.path) for room in arguments.room)
+    ]
+    with ProcessPoolExecutor(arguments.workers, get_context("spawn")) as executor:
+        for constant, found in zip(chosen, executor.map(tried, chosen), strict=True):
+            row(f"`{constant.module}.{constant.name}`", constant.value, found)
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def test_a_file_that_is_cut_off_missing_or_has_a_flipped_bit_is_refused_by_its_n
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ('"version": 2', '"version": 1', r"is of version 1, this scanchain reads 2 .*; make the map again"),
+        ('"version": 3', '"version": 1', r"is of version 1, this scanchain reads 3; make the map again"),
         ("{", "", r"map.json: cannot be read"),
     ],
 )

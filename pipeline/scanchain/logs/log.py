@@ -198,19 +198,20 @@ class Log:
                     counts.reject(complaint, self.scan_count, self.config)
                     continue
                 returns: Returns = message.value
-                points, others = seen_together(returns, self.publishers, latest, is_mirrored=self.is_mirrored)
+                own, others = seen_together(returns, self.publishers, latest, is_mirrored=self.is_mirrored)
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,
                     log_time_ns=message.log_time_ns,
-                    points=points,
+                    points=own.points,
                     times_s=returns.times_s,
                     dropped=returns.dropped,
                     T_odom_base=T_odom_base,
                     waited_s=working_s() - requested_s,
-                    is_copy=counts.repeats(points),
+                    is_copy=counts.repeats(own.points),
                     clock_jump_s=jump_s,
                     others=others,
+                    origin=own.origin if own.origin.any() else None,
                 )
                 counts.add(scan)
                 self.scans_with_wheels += T_odom_base is not None

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scanchain.data import OtherPoints, Pose, RawPoints
+from scanchain.data import OtherPoints, Pose
 from scanchain.errors import duration
 from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns, moved
@@ -94,23 +94,26 @@ class Publishers:
 
 def seen_together(
     returns: Returns, publishers: Publishers, latest: dict[str, tuple[int, OtherPoints]], *, is_mirrored: bool
-) -> tuple[RawPoints, OtherPoints | None]:
-    """Points of a scan in the first publisher's frame, and those of other publishers just before it.
+) -> tuple[OtherPoints, tuple[OtherPoints, ...]]:
+    """Points of a scan in the first publisher's frame, and those of each other publisher just before it.
 
     latest : header stamp and points of the last scan of each frame; updated
     """
-    points, times_s = moved(returns.points, publishers.of(returns.frame).T_first_frame), returns.times_s
-    points = points * np.array([1.0, -1.0], np.float32) if is_mirrored else points
+    T, d = publishers.of(returns.frame).T_first_frame, returns.points.shape[1]
+    points, origin = moved(returns.points, T), np.zeros(d) if T is None else T[:d, -1]
+    if is_mirrored:
+        points, origin = points * np.array([1.0, -1.0], np.float32), origin * [1.0, -1.0]
+    own = OtherPoints(points, returns.times_s, origin)
     if len(publishers.known) < 2:
-        return points, None
-    near = [
-        (other.points, other.times_s + 1e-9 * (other_ns - returns.stamp_ns))
+        return own, ()
+    near = tuple(
+        other._replace(times_s=other.times_s + np.float32(1e-9 * (other_ns - returns.stamp_ns)))
         for frame, (other_ns, other) in latest.items()
         if frame != returns.frame and 0 <= returns.stamp_ns - other_ns <= _TOGETHER_NS
-    ]
-    times_s = times_s if len(times_s) else np.zeros(len(points), np.float32)
-    latest[returns.frame] = returns.stamp_ns, OtherPoints(points, times_s)
-    return points, OtherPoints(*map(np.concatenate, zip(*near, strict=True))) if near else None
+    )
+    times_s = returns.times_s if len(returns.times_s) else np.zeros(len(points), np.float32)
+    latest[returns.frame] = returns.stamp_ns, own._replace(times_s=times_s)
+    return own, near
 
 
 def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tuple[Decoded, Pose | None, float]]:

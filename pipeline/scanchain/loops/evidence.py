@@ -52,12 +52,11 @@ def compared(
         nearest = int(away_m.argmin())
         if away_m[nearest] <= _NEAR_M[d]:
             other = viewed[nearest]
-            nearest_ranges(lie.lift_points(viewer.points), ranges_m)
-            T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
-            margin_m = _MARGIN_M[d] * viewer.scale
-            counts += compare_ranges(
-                lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
-            )
+            margin_m, points = _MARGIN_M[d] * viewer.scale, lie.lift_points(other.points)
+            for T_odom_viewer, seen in viewer.views(viewer.T_odom_lidar):
+                nearest_ranges(lie.lift_points(seen), ranges_m)
+                T_viewer_viewed = lie.lift(lie.between(T_odom_viewer, other.T_odom_lidar))
+                counts += compare_ranges(points, T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE)
     return counts
 
 

@@ -89,8 +89,9 @@ class PlanarMapSearch:
 
     def __init__(self, keyframes: Sequence[Keyframe], resolution_m: float) -> None:
         """Rasterize keyframes, whose ``T_odom_lidar`` is T_map_lidar."""
-        self.keyframes, clouds = keyframes, [keyframe.points for keyframe in keyframes]
-        T_map_lidar = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
+        self.keyframes = keyframes
+        views = [view for keyframe in keyframes for view in keyframe.views(keyframe.T_odom_lidar)]
+        T_map_lidar, clouds = np.array([T for T, _ in views]), [points for _, points in views]
         reach_m = max(float(np.abs(cloud).max(initial=0.0)) for cloud in clouds)
         self.resolution_m = fitting_resolution(
             T_map_lidar, resolution_m=resolution_m, max_range_m=reach_m, max_cells=_MAX_CELLS

@@ -39,10 +39,10 @@ class Submap:
     radius_m: float
 
     def views(self, count: int) -> Iterator[tuple[Pose, Points]]:
-        """T_anchor_lidar and points (N, d) in the lidar's frame of at most ``count`` members, evenly spread."""
+        """T_anchor_lidar and points (N, d) in the lidar's frame of ``count`` members at most, evenly spread."""
         T_anchor_odom = lie.inverse(self.anchor.T_odom_lidar)
         for member in self.members[:: max(-(-len(self.members) // count), 1)]:
-            yield T_anchor_odom @ member.T_odom_lidar, member.points
+            yield from member.views(T_anchor_odom @ member.T_odom_lidar)
 
     def points(self) -> Points:
         """(M, d) meters within the radius, anchor's frame."""

@@ -3,12 +3,13 @@
     map.json       version, dimension, number of keyframes and points, the sessions it was made of, and the CRC-32
                    of each of the other files
     keyframes.npz  poses (K, d+1, d+1) T_map_lidar; stamps_ns, scan_index, session, traveled_m, scale, count,
-                   step_m and is_wide (K,)
+                   step_m and is_wide (K,); spans (S, 2 + d) number of a keyframe, of points, origin of their rays:
+                   none where all rays start at the origin of the keyframe's frame
     edges.npz      pairs (E, 2), measurements (E, d+1, d+1), information (E, k, k), is_loop, weight (E,)
     points.i16     coordinates (count, d) of one keyframe after the other, in units of its step_m; little-endian
                    int16, or int32 where it is_wide
 
-Points stay on disk and are read keyframe by keyframe. Maps of version 1 had no checksums and are refused.
+Points stay on disk and are read keyframe by keyframe. Maps of versions 1 and 2 are refused.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Keyframe, Matrix, Points
+from scanchain.data import Keyframe, Matrix, Points, RaySpan
 from scanchain.errors import InputError, one_line, printable, shown
 from scanchain.files import write_whole
 
 MAP_FOLDER = "map"
-VERSION = 2
+VERSION = 3
 _INDEX, _KEYFRAMES, _EDGES, _POINTS = "map.json", "keyframes.npz", "edges.npz", "points.i16"
 _NUMBER, _WIDE = np.dtype("<i2"), np.dtype("<i4")
 _ROW = np.dtype([
@@ -105,6 +106,7 @@ class SavedPoints:
 
     rows: NDArray[np.number]
     step_m: float
+    spans: tuple[RaySpan, ...] = ()
 
     def read(self) -> Points:
         """(M, d) meters."""
@@ -146,7 +148,7 @@ def write_saved_map(saved: SavedMap) -> None:
     """Write a map into its folder, which must not exist; map.json is written last."""
     folder, keyframes = saved.folder, saved.keyframes
     folder.mkdir(parents=True)
-    rows = np.empty(len(keyframes), _ROW)
+    rows, spans = np.empty(len(keyframes), _ROW), []
     with (folder / _POINTS).open("wb") as file:
         for place, each in enumerate(keyframes):
             points = each.points
@@ -157,7 +159,9 @@ def write_saved_map(saved: SavedMap) -> None:
             file.write(np.rint(points / step_m).astype(number).tobytes())
             stored = len(points), step_m, is_wide
             rows[place] = *stored, each.stamp_ns, each.scan_index, each.traveled_m, each.scale
+            spans += [(place, span.rays, *span.origin) for span in each.stored.spans]
     columns: dict[str, Any] = {name: rows[name] for name in _ROW.names or ()}
+    columns["spans"] = np.array(spans, float).reshape(-1, 2 + saved.dimension)
     np.savez(folder / _KEYFRAMES, poses=saved.poses, session=saved.session, **columns)
     np.savez(folder / _EDGES, **{name: getattr(saved.edges, name) for name in _EDGE_ARRAYS})
     crc32 = {name: _crc32(folder / name) for name in (_KEYFRAMES, _EDGES, _POINTS)}
@@ -186,7 +190,8 @@ def open_saved_map(path: Path) -> SavedMap:
             raise _damaged(folder / _KEYFRAMES, f"holds other keyframes and points than {_INDEX} says")
         E, k, pose = len(edges["pairs"]), 3 * (d - 1), (d + 1, d + 1)
         of_edges = ((2,), pose, (k, k), (), ())
-        _check(rows, {"poses": (K, *pose), "session": (K,)} | dict.fromkeys(_ROW.names or (), (K,)))
+        shapes = {"poses": (K, *pose), "session": (K,), "spans": (len(rows["spans"]), 2 + d)}
+        _check(rows, shapes | dict.fromkeys(_ROW.names or (), (K,)))
         _check(edges, {name: (E, *shape) for name, shape in zip(_EDGE_ARRAYS, of_edges, strict=True)})
         _check_range(rows["session"], "session", len(index.sessions))
         _check_range(edges["pairs"], "pairs", K)
@@ -233,7 +238,10 @@ def _keyframes(rows: dict[str, Any], path: Path, d: int) -> tuple[Keyframe, ...]
     columns = zip(*(rows[name].tolist() for name in _ROW.names or ()), strict=True)
     for k, (_, step_m, is_wide, stamp_ns, scan_index, traveled_m, scale) in enumerate(columns):
         numbers = points[ends[k] - sizes[k] : ends[k]].view(_WIDE if is_wide else _NUMBER).reshape(-1, d)
-        stored = SavedPoints(numbers, step_m)
+        spans = tuple(RaySpan(row[2:], int(row[1])) for row in rows["spans"][rows["spans"][:, 0] == k])
+        if spans and sum(span.rays for span in spans) != len(numbers):
+            raise ValueError(f"the spans of keyframe {k} are not those of its {len(numbers)} points")
+        stored = SavedPoints(numbers, step_m, spans)
         keyframes.append(Keyframe(k, scan_index, stamp_ns, stored, rows["poses"][k], traveled_m, scale))
     return tuple(keyframes)
 
@@ -244,8 +252,7 @@ def _index(path: Path) -> _Index:
         version = msgspec.json.decode(data)["version"]
         if version != VERSION:
             raise InputError(
-                f"{path}: is of version {shown(version)}, this scanchain reads {VERSION} (version 1 had no "
-                "checksums); make the map again"
+                f"{path}: is of version {shown(version)}, this scanchain reads {VERSION}; make the map again"
             )
         return msgspec.json.decode(data, type=_Index)
     except (msgspec.MsgspecError, KeyError, TypeError, OSError, UnicodeDecodeError) as error:

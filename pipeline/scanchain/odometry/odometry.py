@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config, MatchingConfig
-from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior, Scan, State, brief
+from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior, RaySpan, Scan, State, brief
 from scanchain.errors import InputError, counted, shown
 from scanchain.graph.growing_array import read_only
 from scanchain.kernels.geometry import largest_magnitude
@@ -39,7 +39,8 @@ class Tracked(msgspec.Struct, frozen=True):
     scan's stamp, at which ``T_odom_lidar`` holds, in the lidar frame; the seconds are the run times by stage.
     ``prior`` is that of this pose, its covariance that at the middle of the scan;
     ``elsewhere_m`` is how far away it may be where its motion is unknown, else 0;
-    ``is_repeated`` if its points are those of the scan before.
+    ``is_repeated`` if its points are those of the scan before;
+    ``spans`` are the origins of the rays of ``points``, () where all start at that of the lidar frame.
     """
 
     __repr__ = brief
@@ -56,6 +57,7 @@ class Tracked(msgspec.Struct, frozen=True):
     map_s: float
     elsewhere_m: float = 0.0
     is_repeated: bool = False
+    spans: tuple[RaySpan, ...] = ()
 
 
 class _Registered(msgspec.Struct, frozen=True):
@@ -175,6 +177,7 @@ class Odometry:
             match_s=aligned - began,
             map_s=working_s() - aligned,
             elsewhere_m=registered.elsewhere_m,
+            spans=sweep.spans,
         )
         tracked = self._at_stamp(tracked, sweep, prediction)
         is_open = tracked.state is not State.OK

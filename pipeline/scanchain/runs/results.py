@@ -253,7 +253,8 @@ def cloud_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Cl
 def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Iterator[View]:
     """Free space of keyframes at their final poses (K, d+1, d+1)."""
     for T, keyframe in zip(poses, keyframes, strict=True):
-        yield View(T, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
+        for T_world_origin, points in keyframe.views(T):
+            yield View(T_world_origin, points, keyframe.scale * config.preprocess.map_voxel_m)
 
 
 def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
@@ -262,5 +263,5 @@ def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) ->
         poses, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
     )
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
-    scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
-    return draw_grid(scans, fitting)
+    views = (each for T, keyframe in zip(poses, keyframes, strict=True) for each in keyframe.views(T))
+    return draw_grid(views, fitting)

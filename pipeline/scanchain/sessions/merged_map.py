@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, Closure, KeyframePoints, Matrix, Points, Trajectory
+from scanchain.data import REJECTED_WEIGHT, Closure, KeyframePoints, Matrix, Points, RaySpan, Trajectory
 from scanchain.errors import InputError
 from scanchain.graph.g2o import write_g2o
 from scanchain.loops import refined, spread
@@ -167,6 +167,11 @@ class RemainingPoints:
 
     stored: KeyframePoints
     kept: NDArray[np.bool_]
+
+    @property
+    def spans(self) -> tuple[RaySpan, ...]:
+        """Origins of the rays of the points that remain."""
+        return RaySpan.among(self.stored.spans, np.flatnonzero(self.kept))
 
     def read(self) -> Points:
         """(N, d) meters."""
