@@ -93,7 +93,6 @@ class BackEnd:
         starts_segment : whether that motion is so uncertain that only loops can tell where the keyframe is
         """
         self.keyframes.append(keyframe)
-        self.errors.append(errors)
         number, T_odom_lidar = keyframe.index, keyframe.T_odom_lidar
         if number == 0:
             self.graph.add_pose(self.placement.T_world_odom @ T_odom_lidar, keyframe.stamp_ns)
@@ -101,8 +100,9 @@ class BackEnd:
             T_odom_last = self.keyframes[-2].T_odom_lidar
             self.graph.add_pose(self.placement.predict(T_odom_last, T_odom_lidar), keyframe.stamp_ns)
             if number == self.first:
-                starts_segment = True
+                starts_segment, errors = True, errors._replace(renewal=1.0)
                 constraints = [self._unknown_start(lie.between(T_odom_last, T_odom_lidar)), *constraints]
+        self.errors.append(errors)
         if starts_segment:
             self.placement.start_segment(number)
         for factor, i, Z, information in constraints:

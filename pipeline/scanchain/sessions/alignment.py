@@ -136,11 +136,14 @@ def _walked(
         path = back_end.keyframes[old:]
         placed = refined(placed, lambda n: path[n].points, target.keyframes, state.poses[:old], config)
     i, j = state.edges[state.is_loop & ~state.is_rejected].T
-    loops = int(((i < old) & (j >= old)).sum())
+    begin = old if T_target_first is None else old + 1  # the walk that found this pose has its closures
+    loops = int(((i < old) & (j >= begin)).sum())
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
     poses[list(order)] = placed
     closures = (
-        replace(c, source=old + order[c.source - old]) for c in back_end.placement.closures if c.target < old
+        replace(c, source=old + order[c.source - old])
+        for c in back_end.placement.closures
+        if c.target < old and c.source >= begin
     )
     return Alignment(poses, tuple(closures), loops, bool(loops and segments[0] == segments[-1]))
 

@@ -163,6 +163,7 @@ class Localizer:
         final_sigma_m = np.full(len(is_placed), np.nan)
         if is_placed.any():
             graph, own = with_map_errors(result.graph, result.map_errors, self.slam.config)  # the map is fixed
+            own[first] = 0.0
             variances = np.diagonal((graph.covariances() + own)[first:], axis1=1, axis2=2)[:, : graph.dimension]
             final_sigma_m[is_placed] = np.sqrt(variances.sum(axis=1))[keyframe_of[is_placed]]
         return Localization(
@@ -214,10 +215,14 @@ class Localizer:
             self.state = MapState.UNMATCHED if is_known else MapState.OUTSIDE
 
     def _errors(self, information: Matrix, keyframe: int, *, is_loop: bool) -> tuple[Matrix, Matrix]:
-        """Covariances (k, k) of an edge to a keyframe, and of that keyframe's own pose error."""
-        errors = self.slam.back_end.errors[keyframe : keyframe + 1]
+        """Covariances (k, k) of an edge to a keyframe, and of that keyframe's own pose error.
+
+        The first keyframe has none of its own: its scan begins the map of odometry.
+        """
+        back_end = self.slam.back_end
+        errors = back_end.errors[keyframe : keyframe + 1]
         edge, own = edge_errors(information, np.array([is_loop]), errors, self.slam.config)
-        return edge[0], own[0]
+        return edge[0], own[0] if keyframe > back_end.first else np.zeros_like(own[0])
 
 
 def _moved(covariance: Matrix, keyframe: Keyframe, T_odom_lidar: Pose) -> Matrix:
