@@ -31,8 +31,8 @@ from scanchain.data import (
 )
 from scanchain.errors import InputError, counted
 from scanchain.graph.factors import Odometry
-from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.growing_array import GrowingArray
 from scanchain.loops import ClosureTable, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, Located, checked_start

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix, State, Step, Trajectory
-from scanchain.graph.growing_array import Columns
+from scanchain.growing_array import Columns
 
 _SINGULAR = 1e-12  # ratio of smallest to largest eigenvalue below which an information matrix is not inverted
 

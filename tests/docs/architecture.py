@@ -19,7 +19,7 @@ from tests.support.scenes import ROOT
 FILE = ROOT / "docs" / "pictures" / "architecture.svg"
 WIDTH, HEIGHT = 11.0, 8.0  # inches
 FOUNDATION = "range_noise"  # from its row on, whatever imports it is not drawn
-ACROSS = 8  # largest number of boxes of the foundation next to each other
+ACROSS = 9  # largest number of boxes of the foundation next to each other
 BOX_HEIGHT = 0.52  # of the distance between two layers
 
 

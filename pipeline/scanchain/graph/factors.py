@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scanchain import checks, lie
 from scanchain.data import Integers, Mask, Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.graph.growing_array import read_only
+from scanchain.growing_array import read_only
 from scanchain.kernels.graph import between
 
 ORIGIN = -1  # index i of a unary edge: the origin of the world, which is fixed

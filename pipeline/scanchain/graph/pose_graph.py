@@ -38,11 +38,11 @@ from scanchain.graph.factors import (
     kinds_of,
     of_residuals,
 )  # fmt: skip
-from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, InflatedSegment, corrected, odometry_of
 from scanchain.graph.optimization import Optimization, Rejection, Since
 from scanchain.graph.problem import GraphProblem
+from scanchain.growing_array import GrowingArray
 
 
 class PoseGraph:

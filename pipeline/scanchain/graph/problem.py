@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
 from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, SIGHTINGS, WHOLE, Factor, kinds_of
-from scanchain.graph.growing_array import read_only
+from scanchain.growing_array import read_only
 from scanchain.kernels.graph import between
 
 

@@ -9,7 +9,7 @@ from typing import Any, overload
 import numpy as np
 
 from scanchain.data import Closure, ClosureVerdict, Match, Problem, Proposal
-from scanchain.graph.growing_array import Columns
+from scanchain.growing_array import Columns
 
 _TEXTS = {"reason": str, "cause": str, "verdict": ClosureVerdict, "proposed_by": Proposal}
 _OF_MATCH = [field.name for field in fields(Match)]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.growing_array import GrowingArray
 from scanchain.kernels.graph.paths import path_lengths
 
 _MIN_WEIGHT = 0.5  # robust weight of a loop edge above which it connects its keyframes

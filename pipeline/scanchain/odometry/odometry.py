@@ -14,7 +14,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config, MatchingConfig
 from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior, RaySpan, Scan, State, brief
 from scanchain.errors import InputError, counted, shown
-from scanchain.graph.growing_array import read_only
+from scanchain.growing_array import read_only
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps

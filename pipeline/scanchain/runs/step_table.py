@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.evaluation import motion_nees, pair
-from scanchain.graph.growing_array import Columns
+from scanchain.growing_array import Columns
 from scanchain.runs.evidence import evidence_of
 from scanchain.steps import STAGES, Steps
 from scanchain.verdict import CHECKS
