@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from scanchain.config import LocalMapConfig
 from scanchain.range_noise import RangeNoise
-from scanchain.registration import VoxelMap
 from tests.support.scenes import shared_data
 
 
@@ -63,12 +61,6 @@ def test_of_scans_of_clutter_alone_it_is_unknown(dimension):
     points = np.random.default_rng(0).uniform(-5.0, 5.0, (2000, dimension)).astype(np.float32)
     noise = RangeNoise().measured(points).measured(points)
     assert noise.sigma_m == 0.0 and noise.text.startswith("unknown")
-
-
-def test_voxels_grow_where_the_noise_would_fill_them_and_no_sooner(dimension):
-    config = LocalMapConfig(voxel_size_m=0.2)
-    assert VoxelMap(dimension, config, 0.5, noise_m=0.03).voxels.size_m == pytest.approx(0.1)
-    assert VoxelMap(dimension, config, 0.5, noise_m=0.08).voxels.size_m > 0.19
 
 
 @pytest.mark.parametrize(
