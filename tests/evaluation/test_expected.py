@@ -9,12 +9,23 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import ScanPoses, disagreement, expected_errors, motion_nees, sampled_map, sharpness
+from scanchain.evaluation import (
+    ScanPoses,
+    absolute_error,
+    disagreement,
+    expected_ate,
+    expected_errors,
+    motion_nees,
+    pair,
+    sampled_map,
+    sharpness,
+)
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.trajectory import read_tum, write_wide_tum
 from tests.benchmarks.trust import judged, placed
 from tests.support import made
+from tests.support.graphs import PLAIN, graph_of, ring
 
 pytestmark = pytest.mark.error_bars
 
@@ -124,3 +135,27 @@ def test_errors_drawn_from_the_covariances_have_a_nees_of_one(k):
     np.testing.assert_allclose(twice, 0.25 * nees)
     covariances[7] = np.nan
     assert np.flatnonzero(np.isnan(motion_nees(truth, covariances, truth))).tolist() == [6, 7]
+
+
+def test_of_results_of_redrawn_measurements_95_of_100_lie_within_the_bounds_of_the_expected_ate(dimension):
+    rng = np.random.default_rng(0)
+    _, true = ring(dimension, count=24)
+    inside = 0
+    for _ in range(100):
+        graph = redrawn(true, rng)
+        bounds = expected_ate(graph)
+        poses = Trajectory(graph.stamps_ns, lie.lift(graph.poses))
+        ate = absolute_error(pair(poses, Trajectory(graph.stamps_ns, lie.lift(true))))
+        inside += bounds.low <= ate.translation_m.rmse <= bounds.high
+    assert 90 <= inside <= 99
+
+
+def redrawn(true, rng):
+    """A ring, optimized, whose edges err as their information says."""
+    k = 3 if len(true[0]) == 3 else 6
+    sigma = rng.uniform(0.005, 0.03, k)
+    edges = np.stack([np.arange(len(true)), (np.arange(len(true)) + 1) % len(true)], axis=1)
+    measured = lie.between(*true[edges.T]) @ lie.exp(sigma * rng.normal(size=(len(true), k)))
+    graph = graph_of(true, edges, measured, np.diag(sigma**-2.0), stamps_ns=1_000_000_000 * np.arange(len(true)))
+    graph.optimize(PLAIN)
+    return graph

@@ -9,7 +9,7 @@ from scanchain.graph.certificate import Minorants, dual_matrix, minorize
 from scanchain.graph.cholesky import BlockPattern
 from scanchain.graph.problem import GraphProblem
 from tests.support import naive_graph
-from tests.support.graphs import PLAIN, closed_ring, graph_of, published
+from tests.support.graphs import PLAIN, closed_ring, graph_of, published, sight
 
 
 def minorant_values(bound, chi2, G_i, G_j, leap):
@@ -200,3 +200,13 @@ def test_no_information_that_is_taken_overflows(dimension, information):
         assert np.isfinite(graph.optimize(PLAIN).chi2_after)
         graph.certify()
     assert np.isfinite(graph.poses).all()
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_a_ring_with_a_point_is_certified_unless_it_is_wound_up(turns):
+    graph = closed_ring(2, 30, turns)
+    mark = graph.add_point(np.array([2.0, 1.0]), 99)
+    sight(graph, (0, mark), (2.0, 1.1), np.eye(2))
+    sight(graph, (1, mark), (2.1, 1.0), np.eye(2))
+    assert graph.optimize(PLAIN, initialize="given").converged
+    assert graph.certify().certified == (turns == 0)

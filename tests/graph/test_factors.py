@@ -303,20 +303,6 @@ def test_a_prior_without_information_constrains_nothing():
     assert np.isfinite(graph.covariances()).all()
 
 
-@pytest.mark.parametrize("initialize", ["odometry", "spanning-tree", "chordal"])
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_initial_poses_come_from_positions_in_the_world_alone(dimension, initialize):
-    rng, k = np.random.default_rng(5), lie.twist_size(lie.identity(dimension))
-    true = lie.exp(rng.normal(size=(6, k)))
-    edges = np.array([(i, i + 1) for i in range(5)])
-    graph = graph_of(lie.exp(rng.normal(size=(6, k))), edges, lie.between(*true[edges.T]), np.eye(k))
-    for j in (0, 2, 3, 5):
-        graph.add_factor(Position(), j, np.eye(dimension), true[j])
-    done = graph.optimize(GraphConfig(robust="none"), initialize=initialize)
-    assert done.chi2_before > 1.0 and done.iterations <= 1
-    assert np.allclose(graph.poses, true, atol=1e-6)
-
-
 def test_the_origin_is_no_pose_in_messages():
     graph, true = drive(3)
     graph.add_factor(Prior(), 0, np.eye(3), true[0])

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.errors import InputError
-from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, ranks
+from scanchain.graph.edge_checks import positive_semidefinite
 from scanchain.graph.factors import Prior
 from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.settings import load_settings
@@ -211,16 +211,6 @@ def test_a_poor_fit_points_to_the_robust_losses_which_leave_the_chain_alone(call
         assert read_g2o(out).graph.poses[-1][0, 2] == pytest.approx(7.0, abs=0.01)
 
 
-@pytest.mark.parametrize("k", [2, 3, 6])
-def test_the_rank_of_an_information_matrix_does_not_depend_on_its_units(k):
-    rng = np.random.default_rng(0)
-    for rank in range(k + 1):
-        A = rng.normal(size=(20, rank, k))
-        units = np.diag(10.0 ** rng.uniform(-6.0, 6.0, k))
-        assert (ranks(units @ np.swapaxes(A, 1, 2) @ A @ units) == rank).all()
-    assert ranks(np.diag([1e-12, *[1e9] * (k - 1)])[None]).tolist() == [k]
-
-
 @pytest.mark.parametrize("tag", ["EDGE2 0 1 1 0 0 1 0 1 1 5 0", "EDGE_SE2 0 1 1 0 0 1 0 5 1 0 1"])
 def test_indefinite_matrices_are_projected_with_a_warning_that_says_how_many_how_far_and_which_first(tag, read):
     with pytest.warns(UserWarning, match="1 of 2 edges have an indefinite .* first 0-1 in line 1"):
@@ -228,31 +218,6 @@ def test_indefinite_matrices_are_projected_with_a_warning_that_says_how_many_how
     assert (file.projection.edges, file.projection.of) == (1, 2)
     assert file.projection.median == file.projection.most == pytest.approx(4.0 / np.sqrt(53.0))
     assert np.allclose(file.graph.information, [[[3, 0, 3], [0, 1, 0], [3, 0, 3]], np.eye(3)])
-
-
-def test_the_projected_matrix_is_the_nearest_semidefinite_one():
-    rng = np.random.default_rng(0)
-    A = rng.normal(size=(50, 6, 6))
-    A += np.swapaxes(A, 1, 2)
-    nearest = nearest_semidefinite(A)
-    assert positive_semidefinite(nearest).all()
-    # optimal: what is left over is negative semidefinite and orthogonal to the projection
-    assert np.linalg.eigvalsh(A - nearest)[:, -1].max() < 1e-12
-    assert np.abs(np.einsum("eab,eab->e", A - nearest, nearest)).max() < 1e-11
-
-
-@pytest.mark.parametrize(
-    ("corner", "is_sound"),
-    [
-        ([[1.0, 0.5], [0.5, 0.25]], True),  # of rank one
-        ([[-1e-7, 0.0], [0.0, 1.0]], True),  # as printed digits may make it
-        ([[-1e-5, 0.0], [0.0, 1.0]], False),
-    ],
-)
-def test_a_matrix_is_sound_that_is_symmetric_and_has_no_negative_eigenvalue(corner, is_sound):
-    matrix = np.eye(3)
-    matrix[1:, 1:] = corner
-    assert positive_semidefinite(matrix[None]).tolist() == [is_sound]
 
 
 @pytest.mark.parametrize(

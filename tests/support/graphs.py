@@ -56,3 +56,45 @@ def closed_ring(dimension, count, turns, noise=0.0):
     edges = np.stack([np.arange(count), (np.arange(count) + 1) % count], axis=1)
     measured = lie.exp(noise * rng.normal(size=(count, k)))
     return graph_of(lie.exp(twists), edges, measured, np.diag([100.0] * dimension + [1e4] * (k - dimension)))
+
+
+def field(seed=0, noise=0.05, poses=12, points=5):
+    """Poses on a circle that see points inside and outside of it; the guess of the points is poor."""
+    rng = np.random.default_rng(seed)
+    angles = 2.0 * np.pi * np.arange(poses) / poses
+    true = np.array([lie.pose_2d(4 * np.cos(a), 4 * np.sin(a), a + np.pi / 2) for a in angles])
+    marks = rng.uniform(-6.0, 6.0, (points, 2))
+    graph = graph_of([T @ lie.exp(0.05 * rng.normal(size=3)) if index else T for index, T in enumerate(true)])
+    for index, mark in enumerate(marks):
+        graph.add_point(mark + rng.normal(size=2), 100 + index)
+    for i in range(poses - 1):
+        Z = lie.inverse(true[i]) @ true[i + 1] @ lie.exp(noise * rng.normal(size=3))
+        graph.add_edge(i, i + 1, Z, np.diag([4.0, 9.0, 25.0]) / noise**2 / 9)
+    pairs = np.array([(i, poses + p) for i in range(poses) for p in range(points) if (i + p) % 2])
+    T_i = lie.inverse(true[pairs[:, 0]])
+    seen = (T_i[:, :2, :2] @ marks[pairs[:, 1] - poses][..., None])[..., 0] + T_i[:, :2, 2]
+    seen += noise * rng.normal(size=seen.shape)
+    for pair, position in zip(pairs.tolist(), seen, strict=True):
+        sight(graph, pair, position, [[2.0, 0.5], [0.5, 1.0]] / np.array(noise**2))
+    return graph
+
+
+def sight(graph, pair, position, information):
+    """Add a point as seen from a pose."""
+    graph.add_edge(*pair, lie.pose_2d(*position, 0.0), np.pad(information, (0, 1)))
+
+
+def with_false_loops(name, share, seed=0):
+    """A published graph, its loops under suspicion, with random ones added, and the poses it should end with."""
+    true, graph = published(name), published(name, loops="robust")
+    true.optimize(GraphConfig())
+    rng = np.random.default_rng(seed)
+    count = int(share * graph.is_loop.sum())
+    pairs = rng.integers(0, len(graph), (count, 2))
+    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 1]
+    span = np.ptp(true.poses[:, :2, 2], axis=0)
+    twists = rng.uniform(-0.5, 0.5, (len(pairs), 3)) * [*span, 2.0 * np.pi]
+    omega = np.median(graph.information[graph.is_loop], axis=0)
+    real = len(graph.edges)
+    graph.add_edges(pairs, lie.exp(twists), np.tile(omega, (len(pairs), 1, 1)), np.ones(len(pairs), bool))
+    return graph, true, np.arange(len(graph.edges)) >= real

@@ -6,7 +6,7 @@ import pytest
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
-from scanchain.graph.edge_checks import free_poses, ranks
+from scanchain.graph.edge_checks import free_poses, nearest_semidefinite, positive_semidefinite, ranks
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.problem import GraphProblem
 from tests.support import naive_graph
@@ -127,3 +127,38 @@ def test_graphs_of_any_information_end_in_an_answer_or_in_an_error_that_names_po
             assert "not joined to a fixed one" in str(error) or " free: " in str(error)
             continue
         assert not (len(graph.free_poses()) and graph.certify().certified)
+
+
+@pytest.mark.parametrize("k", [2, 3, 6])
+def test_the_rank_of_an_information_matrix_does_not_depend_on_its_units(k):
+    rng = np.random.default_rng(0)
+    for rank in range(k + 1):
+        A = rng.normal(size=(20, rank, k))
+        units = np.diag(10.0 ** rng.uniform(-6.0, 6.0, k))
+        assert (ranks(units @ np.swapaxes(A, 1, 2) @ A @ units) == rank).all()
+    assert ranks(np.diag([1e-12, *[1e9] * (k - 1)])[None]).tolist() == [k]
+
+
+def test_the_projected_matrix_is_the_nearest_semidefinite_one():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(50, 6, 6))
+    A += np.swapaxes(A, 1, 2)
+    nearest = nearest_semidefinite(A)
+    assert positive_semidefinite(nearest).all()
+    # optimal: what is left over is negative semidefinite and orthogonal to the projection
+    assert np.linalg.eigvalsh(A - nearest)[:, -1].max() < 1e-12
+    assert np.abs(np.einsum("eab,eab->e", A - nearest, nearest)).max() < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("corner", "is_sound"),
+    [
+        ([[1.0, 0.5], [0.5, 0.25]], True),  # of rank one
+        ([[-1e-7, 0.0], [0.0, 1.0]], True),  # as printed digits may make it
+        ([[-1e-5, 0.0], [0.0, 1.0]], False),
+    ],
+)
+def test_a_matrix_is_sound_that_is_symmetric_and_has_no_negative_eigenvalue(corner, is_sound):
+    matrix = np.eye(3)
+    matrix[1:, 1:] = corner
+    assert positive_semidefinite(matrix[None]).tolist() == [is_sound]
