@@ -1,6 +1,16 @@
 import numpy as np
+import pytest
 
 from scanchain import lie
+from scanchain.errors import InputError
+from scanchain.graph.covariance import (
+    chosen_poses,
+    difference_covariances,
+    edge_covariances,
+    inverse_blocks,
+    responses,
+    write_covariances,
+)
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.problem import GraphProblem
 from tests.support.graphs import PLAIN, field, ring
@@ -72,3 +82,61 @@ def test_covariances_of_points_equal_the_dense_inverse():
         assert not found[12 + point][2].any()
     adjoint = lie.adjoint(lie.inverse(graph.poses[7]))
     assert np.allclose(found[7], adjoint @ P[18:21, 18:21] @ adjoint.T, rtol=1e-8, atol=1e-12)
+
+
+def covariance_of_all(problem, equations):
+    """Cov(ξ) (K, k, K, k) of the left twists of all poses by the dense inverse, zero for fixed poses."""
+    k, count = problem.freedom, len(problem.variable)
+    at = [
+        k * pose + axis
+        for pose, size in zip(problem.free, problem.pattern.sizes, strict=True)
+        for axis in range(size)
+    ]
+    P = np.zeros((k * count, k * count))
+    P[np.ix_(at, at)] = np.linalg.inv(dense(problem.pattern, equations.values))
+    return P.reshape(count, k, count, k)
+
+
+@pytest.mark.parametrize("graph", [ring(2, 9)[0], ring(3, 7)[0], field()], ids=["plane", "space", "points"])
+def test_covariances_of_differences_equal_those_of_the_dense_inverse(graph):
+    fixed = np.isin(np.arange(len(graph)), (0, 4))
+    problem = GraphProblem(graph.edges, graph.measurements, graph.information, fixed, graph.is_point)
+    equations = problem.linearize(graph.poses, problem.errors(graph.poses), np.ones(len(graph.edges)))
+    problem.cholesky.factorize(equations.values)
+    P = covariance_of_all(problem, equations)
+
+    def expected(pair, other):
+        (i, j), (a, b) = pair, other
+        return P[j, :, b] - P[j, :, a] - P[i, :, b] + P[i, :, a]
+
+    pairs = np.array([(0, 3), (2, 6), (6, 2), (4, 5), (0, 4)])
+    joint = difference_covariances(problem, pairs)
+    for first, pair in enumerate(pairs):
+        for second, other in enumerate(pairs):
+            np.testing.assert_allclose(joint[second, first], expected(pair, other), rtol=1e-8, atol=1e-12)
+    of_edges = edge_covariances(problem, inverse_blocks(problem))
+    for found, edge in zip(of_edges, graph.edges, strict=True):
+        np.testing.assert_allclose(found, expected(edge, edge), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(responses(problem, 2, 6), P[:, :, 6] - P[:, :, 2], rtol=1e-8, atol=1e-12)
+
+
+def test_the_table_has_the_bits_of_the_upper_triangle_of_each_chosen_pose(dimension, tmp_path):
+    ids, k = np.array([7, 3, 12]), 3 * dimension - 3
+    chosen = chosen_poses("12,7", ids)
+    assert chosen.tolist() == [2, 0] and chosen_poses(" all", ids).tolist() == [0, 1, 2]
+    covariances = np.random.default_rng(0).normal(size=(3, k, k))
+    write_covariances(tmp_path / "x.csv", ids[chosen], covariances[chosen])
+    header, *rows = [line.split(",") for line in (tmp_path / "x.csv").read_text().splitlines()]
+    assert (
+        header[:3] == ["id", "x_x", "x_y"] and header[-1] == "yaw_yaw" and [row[0] for row in rows] == ["12", "7"]
+    )
+    for row, pose in zip(rows, chosen, strict=True):
+        assert [float(value) for value in row[1:]] == covariances[pose][np.triu_indices(k)].tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("3,x", "give all, or vertex ids"), ("3,9,5", "5: no such vertex; .* 3 to 12")]
+)
+def test_poses_that_are_none_are_refused(text, words):
+    with pytest.raises(InputError, match=words):
+        chosen_poses(text, np.array([7, 3, 12]))
