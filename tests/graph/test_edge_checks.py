@@ -6,7 +6,16 @@ import pytest
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
-from scanchain.graph.edge_checks import free_poses, nearest_semidefinite, positive_semidefinite, ranks
+from scanchain.graph.edge_checks import (
+    free_poses,
+    has_loop,
+    listed,
+    loose,
+    nearest_semidefinite,
+    positive_semidefinite,
+    ranks,
+    skip_poses,
+)
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.problem import GraphProblem
 from tests.support import naive_graph
@@ -162,3 +171,40 @@ def test_a_matrix_is_sound_that_is_symmetric_and_has_no_negative_eigenvalue(corn
     matrix = np.eye(3)
     matrix[1:, 1:] = corner
     assert positive_semidefinite(matrix[None]).tolist() == [is_sound]
+
+
+def test_poses_without_a_chain_to_a_fixed_one_are_loose_and_more_edges_than_a_forest_has_are_a_loop():
+    rng = np.random.default_rng(3)
+    loops = []
+    for _ in range(200):
+        count = int(rng.integers(2, 9))
+        edges = rng.integers(0, count, (int(rng.integers(0, 9)), 2))
+        fixed = rng.random(count) < 0.3
+        part, cycles = list(range(count)), 0
+        for i, j in edges.tolist():
+            cycles += part[i] == part[j]
+            part = [part[i] if each == part[j] else each for each in part]
+        joined = {part[pose] for pose in np.flatnonzero(fixed)}
+        assert loose(edges, fixed).tolist() == [pose for pose in range(count) if part[pose] not in joined]
+        assert has_loop(edges, count) == (cycles > 0)
+        loops.append(cycles > 0)
+    assert 20 < sum(loops) < 180
+
+
+def test_edges_skip_poses_that_join_others_than_successive_ones_unless_one_is_a_point():
+    edges = np.array([(0, 1), (1, 0), (0, 2), (3, 0), (0, 4), (4, 2)])
+    assert skip_poses(edges, np.arange(5) == 4).tolist() == [False, False, True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        ([3], "3"),
+        ([3, 4], "3, 4"),
+        ([3, 5, 6, 7, 9], "3, 5 to 7, 9"),
+        (range(0, 18, 2), "0, 2, 4, 6, 8, 10, 12, 14, ..."),
+        (range(0, 16, 2), "0, 2, 4, 6, 8, 10, 12, 14"),
+    ],
+)
+def test_names_in_sequence_are_listed_as_a_range_and_scattered_ones_cut_off(names, text):
+    assert listed(np.array(names)) == text

@@ -6,6 +6,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import GraphConfig
+from scanchain.graph.explanation import RejectedLoops
 from scanchain.graph.odometry_errors import corrected
 from tests.support.graphs import graph_of
 
@@ -104,3 +105,39 @@ def test_steps_as_short_as_their_noise_are_no_drift_of_the_scale():
     graph = graph_of(true, edges, measured, np.diag(sigma**-2), is_loop)
     assert graph.optimize(GraphConfig(), initialize="given").rejected.sum() >= 10
     assert not graph.drift.any() and not graph.inflated
+
+
+def test_errors_of_odometry_change_chi2_and_the_residuals_of_rejected_loops_as_in_the_graph_optimized_anew(
+    dimension,
+):
+    rng, k, count = np.random.default_rng(4), 3 * dimension - 3, 24
+    true = np.array(list(accumulate([lie.exp(np.eye(k)[0] + 0.3 * np.eye(k)[-1])] * count, np.matmul)))
+    chain = [(i, i + 1) if i % 3 else (i + 1, i) for i in range(count - 1)]
+    edges = np.array([*chain, (0, 20), (3, 23), (1, 12), (9, 21), (15, 2)])
+    kept = np.arange(len(edges)) < len(chain) + 2
+    sigma, is_loop = rng.uniform(0.01, 0.03, k), np.arange(len(edges)) >= len(chain)
+    Z = lie.between(*true[edges.T]) @ lie.exp(sigma * rng.normal(size=(len(edges), k)))
+    omega = np.diag(sigma**-2.0)
+
+    def optimized(measured):
+        graph = graph_of(true, edges[kept], measured[kept], omega)
+        return graph.optimize(GraphConfig(robust="none", tolerance=1e-14)).chi2_after, graph.poses.copy()
+
+    chi2, poses = optimized(Z)
+    problem = graph_of(true, edges, Z, omega, is_loop)._prepared()
+    odometry = np.arange(len(chain))
+    loops = RejectedLoops(problem, poses, odometry, kept)
+    assert loops.edges.tolist() == np.flatnonzero(~kept).tolist() and loops.stride == 1
+    among = slice(5, 15)
+    twists, changes = 0.01 * rng.normal(size=(10, k, 2)), []
+    for sign in (1.0, -1.0):
+        moved = Z.copy()
+        moved[odometry[among]] = Z[odometry[among]] @ lie.exp(sign * twists[..., 0])
+        chi2_moved, poses_moved = optimized(moved)
+        changes.append((chi2_moved - chi2, (problem.errors(poses_moved) - loops.errors)[loops.edges]))
+    (ahead, residuals), (back, others) = changes
+    b, A = loops.quadratic(twists, among)
+    assert A[0, 0] == pytest.approx(0.5 * (ahead + back), rel=0.03)
+    assert b[0] == pytest.approx(0.25 * (back - ahead), rel=0.03)
+    found = np.array([shift.sum(axis=0)[:, 0] for shift in loops.shifts(twists, among)])
+    np.testing.assert_allclose(found, 0.5 * (residuals - others), atol=0.03 * np.abs(found).max())

@@ -5,6 +5,8 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import GraphConfig
+from scanchain.graph.factors import Position
+from scanchain.graph.optimization import fit, has_loops, solve
 from scanchain.graph.pose_graph import PoseGraph
 from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support.graphs import BEST, PLAIN, graph_of, published, ring, with_false_loops
@@ -164,3 +166,32 @@ def test_an_update_takes_in_a_loop_as_far_off_as_odometry_may_be_and_no_farther(
     assert graph.weight.tolist() == [1.0] * 21 + [float(is_taken)]
     assert graph.poses[20, 0, 2] == pytest.approx(20.0 + is_taken * off_m, abs=0.01)
     assert answer.cost_after < answer.chi2_before
+
+
+def test_a_fit_counts_edges_in_force_and_a_loop_is_one_by_edges_of_the_origin_too():
+    poses = [lie.pose_2d(float(x), 0.0, 0.0) for x in range(4)]
+    graph = graph_of(poses, [(k, k + 1) for k in range(3)], [lie.pose_2d(1.0, 0.0, 0.0)] * 3, np.eye(3))
+    graph.optimize(GraphConfig())
+    assert not has_loops(graph.state())
+    with_loop, with_origin = graph.copy(), graph.copy()
+    with_loop.add_edge(0, 3, lie.pose_2d(30.0, 0.0, 0.0), 1e4 * np.eye(3), is_loop=True)
+    assert has_loops(with_loop.state())
+    state = with_loop.optimize(GraphConfig()).state
+    assert state.is_rejected.sum() == 1 and not has_loops(state) and "1 edge rejected" in fit(state)
+    with_origin.add_factor(Position(), 0, np.eye(2))
+    assert not has_loops(with_origin.state())
+    with_origin.add_factor(Position(), 3, np.eye(2), poses[3])
+    assert has_loops(with_origin.state()) and "rejected" not in fit(with_origin.state())
+
+
+def test_the_minimum_has_rotations_to_the_last_digit_and_fixed_poses_to_the_bit_however_far_off(dimension):
+    graph, _ = ring(dimension, count=60, noise=0.05)
+    poses = lie.exp(np.append(np.full(dimension, 1e6), np.ones(2 * dimension - 3))) @ graph.poses
+    problem = graph._prepared()
+    minimum = solve(problem, poses, PLAIN, "given")
+    found = minimum.estimate.poses
+    R = found[:, :-1, :-1]
+    assert np.array_equal(found[0], poses[0]) and minimum.converged
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(dimension), (60, 1, 1)), atol=1e-14)
+    near = solve(problem, graph.poses, PLAIN, "given").estimate
+    assert minimum.estimate.cost == pytest.approx(near.cost, rel=1e-5)
