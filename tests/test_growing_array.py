@@ -29,7 +29,8 @@ def test_views_of_before_keep_the_rows_that_are_replaced_and_what_replaces_them_
     array.extend(np.arange(5.0))
     before, new = array.rows, np.array([7.0, 8.0])
     array.replace(new)
-    new[0] = array.append(9.0)
+    new[0] = 0.0
+    array.append(9.0)
     assert before.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0] and array.rows.tolist() == [7.0, 8.0, 9.0]
 
 
