@@ -5,12 +5,12 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.graph.factors import Position
+from scanchain.graph.factors import Position, edge_information
 from scanchain.graph.optimization import fit, has_loops, solve
 from scanchain.graph.pose_graph import PoseGraph
 from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support.graphs import BEST, PLAIN, graph_of, published, ring, with_false_loops
-from tests.support.scenes import shared_data
+from tests.support.scenes import configured, shared_data
 
 
 def position_error_m(graph, true):
@@ -195,3 +195,29 @@ def test_the_minimum_has_rotations_to_the_last_digit_and_fixed_poses_to_the_bit_
     np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(dimension), (60, 1, 1)), atol=1e-14)
     near = solve(problem, graph.poses, PLAIN, "given").estimate
     assert minimum.estimate.cost == pytest.approx(near.cost, rel=1e-5)
+
+
+def test_a_long_log_that_hangs_on_a_map_by_next_to_no_information_is_optimized():
+    graph, k = PoseGraph(2), 3
+    graph.fix(graph.add_pose(lie.identity(2), 0))
+    anywhere = edge_information(np.zeros((k, k)), 1e4, np.pi)
+    close = edge_information(1e6 * np.eye(k), 0.01, 0.003)
+    for index in range(1, 401):
+        before = index - 1
+        graph.add_pose(lie.pose_2d(0.5 * (before % 2), 0.0, 0.0), index)
+        Z = lie.between(graph.poses[before], graph.poses[index])
+        graph.add_edge(before, index, Z, anywhere if index == 1 else close)
+        if index > 2:
+            graph.add_edge(1 + before % 2, index, lie.identity(2), close, is_loop=True)
+    graph.optimize(configured(2).graph, initialize="given")
+    assert np.allclose(graph.poses[1:3, :2, 2], graph.poses[399:401, :2, 2], atol=1e-6)
+
+
+def test_poses_beyond_a_motion_that_nothing_measured_are_still_optimized():
+    information = np.tile(1e5 * np.eye(3), (199, 1, 1))
+    information[[0, 120]] = edge_information(np.zeros((3, 3)), 19.0, 3.8)
+    chain, poses = [(k, k + 1) for k in range(199)], [lie.pose_2d(float(k), 0.0, 0.0) for k in range(200)]
+    graph = graph_of(poses, chain, [lie.pose_2d(1.0, 0.0, 0.0)] * 199, information)
+    for index in range(150, 160):
+        graph.add_edge(index, index + 30, lie.pose_2d(30.0, 0.0, 0.0), 1e5 * np.eye(3), is_loop=True)
+    assert graph.optimize(configured(2).graph, initialize="given").converged

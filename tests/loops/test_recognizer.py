@@ -1,15 +1,17 @@
-"""A place recognizer of the user's own: loaded by name, asked, checked, and fed again after a checkpoint."""
+"""Closures of recognized places; a recognizer of the user's own: loaded by name, queried, checked, resumed."""
 
 import random
 import subprocess
 import sys
+from functools import cache
 from itertools import islice
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from scanchain.data import ClosureVerdict, Proposal
+from scanchain import lie
+from scanchain.data import ClosureVerdict, Keyframe, Proposal
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.loops import LoopCloser
@@ -17,6 +19,7 @@ from scanchain.runs.directory import POINTS_FILE
 from scanchain.slam import Slam
 from tests.support.killing import taken_up
 from tests.support.scenes import configured, shared_data
+from tests.support.town import graph_of, passage, pose, street
 
 RECOGNIZER = '''
 import numpy as np
@@ -144,3 +147,43 @@ def test_without_one_nothing_is_loaded_from_the_working_directory(folder):
         assert LoopCloser(configured(2, {"loops.recognizer": name}), 2).places.recognizer is None
     assert LoopCloser(configured(3), 3).places.recognizer is not None
     assert np.array_equal(before, sys.path)
+
+
+@cache
+def there_and_back(lost_m=0.0):
+    """Keyframes of a street, and of it again the other way after a detour, odometry so far off."""
+    there = passage(street())
+    back = passage(street(4.0, True), len(there), there[-1].traveled_m + 120.0)
+    shift = pose(lost_m, 0.5 * lost_m, yaw=0.02 * lost_m)
+    moved = [
+        Keyframe(k.index, k.scan_index, k.stamp_ns, k.stored, shift @ k.T_odom_lidar, k.traveled_m) for k in back
+    ]
+    return [*there, *moved], [k.T_odom_lidar for k in (*there, *back)]
+
+
+@pytest.mark.parametrize("lost_m", [0.0, 8.0])
+def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lost_m):
+    keyframes, truth = there_and_back(lost_m)
+    closer = LoopCloser(configured(3), 3).places
+    accepted = [
+        closure
+        for k in range(1, len(keyframes) + 1)
+        for closure in closer.close(
+            keyframes[:k], graph_of(keyframes[:k]), np.ones(k, bool), finish=k == len(keyframes)
+        )
+        if closure.verdict is ClosureVerdict.ACCEPTED
+    ]
+    assert len(accepted) >= 3
+    for closure in accepted:
+        true = lie.inverse(truth[closure.target]) @ truth[closure.source]
+        assert np.linalg.norm((lie.inverse(true) @ closure.match.T_target_source)[:3, 3]) < 0.2
+
+
+@pytest.mark.parametrize(("sigma_rad", "are_refused"), [(0.002, True), (0.2, False)])
+def test_a_place_is_refused_that_odometry_cannot_have_missed_by_so_much(monkeypatch, sigma_rad, are_refused):
+    monkeypatch.setattr("scanchain.loops.recognizer._PLACE_DRIFT", 0.001)
+    keyframes, _ = there_and_back(8.0)
+    closures = LoopCloser(configured(3), 3).places.close(
+        keyframes, graph_of(keyframes, sigma_rad), np.ones(len(keyframes), bool), finish=True
+    )
+    assert closures and all("of the path between" in closure.reason for closure in closures) == are_refused

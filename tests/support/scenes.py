@@ -1,4 +1,4 @@
-"""What several tests share: where the real logs lie."""
+"""What several tests share: real logs, configurations, and points of rooms and streets."""
 
 import os
 import tomllib
@@ -6,6 +6,7 @@ from itertools import islice
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from scanchain.config import Config
@@ -42,6 +43,34 @@ def configured(dimension, changes=None):
     return msgspec.convert(tree, Config)
 
 
+def square(half_m):
+    """A room around the lidar."""
+    along = np.linspace(-half_m, half_m, 200)
+    sides = [np.column_stack([along, np.full(200, side)]) for side in (-half_m, half_m)]
+    return np.vstack([*sides, *(side[:, ::-1] for side in sides)])
+
+
 def stored(points) -> StoredPoints:
     """Points of a keyframe, in a store of their own."""
     return PointStore(points.shape[1]).add(points)
+
+
+def walls(rng, count, side_m):
+    """Points along walls that run with the axes."""
+    lines = []
+    for _ in range(count):
+        start, axis = rng.uniform(0.0, side_m, 2), rng.integers(2)
+        line = np.tile(start, (20, 1))
+        line[:, axis] += np.linspace(0.0, 0.3 * side_m, 20)
+        lines.append(line)
+    return np.concatenate(lines)
+
+
+def sloping_street(rng):
+    """Points of a sloping ground of 80 x 80 m and of walls on it, dense in their height."""
+    ground = rng.uniform(-40.0, 40.0, (30_000, 2))
+    feet = walls(rng, 12, 60.0) - 30.0
+    high = np.repeat(feet, 12, axis=0)
+    ground, high = (np.column_stack([xy, 0.05 * xy[:, 0] - 1.7]) for xy in (ground, high))
+    high[:, 2] += np.tile(np.linspace(0.0, 4.0, 12), len(feet))
+    return ground, high

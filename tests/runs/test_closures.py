@@ -1,9 +1,8 @@
-"""Loop closures: kept in columns, wrong ones found out in the end; the table says what became of each."""
+"""Final verdicts of loop closures: wrong ones are rejected in the end; the table says what became of each."""
 
 import json
 import re
 from collections import Counter, defaultdict
-from dataclasses import fields, replace
 
 import msgspec
 import numpy as np
@@ -12,10 +11,9 @@ import pytest
 
 from scanchain.__main__ import main
 from scanchain.config import GraphConfig
-from scanchain.data import VERIFICATION, Closure, ClosureVerdict, Match, Proposal
+from scanchain.data import VERIFICATION, ClosureVerdict, Proposal
 from scanchain.graph.g2o import read_g2o
 from scanchain.logs import open_log
-from scanchain.loops import ClosureTable
 from scanchain.runs.closures import closures_table, final_verdicts
 from scanchain.runs.metrics import Metrics, lines_of
 from scanchain.runs.step_table import write_table
@@ -215,56 +213,3 @@ def test_a_run_without_loops_has_none_to_check(tmp_path, log):
     said = (tmp_path / "run" / "summary.txt").read_text(encoding="utf-8")
     assert "no loops to check" in said and "χ²" not in said
     assert not (tmp_path / "run" / "graph_rejected.g2o").exists()
-
-
-# closures in columns come back as they were
-
-
-def closures(k):
-    rng = np.random.default_rng(k)
-    size = 3 if k == 3 else 4
-    for source in range(40):
-        match = Match(
-            T_target_source=rng.normal(size=(size, size)),
-            information=rng.normal(size=(k, k)),
-            cost=rng.normal(),
-            inliers=source,
-            points=2 * source,
-            iterations=source % 7,
-            residual_m=rng.normal(),
-            fit=rng.normal(),
-            at_minimum=source % 2 == 0,
-            converged=source % 3 == 0,
-            reason=f"reason {source % 5}",
-            degeneracy_eigenvalue=rng.normal(),
-            observability=np.inf,
-            degeneracy_direction=rng.normal(size=k),
-            cause=f"cause {source % 3}",
-        )
-        verdict = ClosureVerdict.REJECTED if source % 4 else ClosureVerdict.ACCEPTED
-        cause, reason = f"overlap {source % 2}", f"overlap {source % 6}"
-        yield Closure(source // 2, source, match, rng.random(), verdict, reason, Proposal.PLACE, cause=cause)
-
-
-def same(a, b):
-    return type(a) is type(b) and all(
-        same(x, y) if isinstance(x, Match) else type(x) is type(y) and np.array_equal(x, y)
-        for x, y in ((getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
-    )
-
-
-@pytest.mark.parametrize("k", [3, 6])
-def test_closures_come_back_bit_by_bit_and_in_their_types(k):
-    given = [replace(each, chi2_before=float(each.source), chi2_after=1.0) for each in closures(k)]
-    table = ClosureTable()
-    table.extend(given[:17])
-    table.extend(given[17:])
-    assert len(table) == len(given)
-    assert all(same(a, b) for a, b in zip(given, table, strict=True))
-    assert same(table[-1], given[-1]) and [each.source for each in table[3:9:2]] == [3, 5, 7]
-
-
-def test_an_empty_table_holds_nothing():
-    assert not ClosureTable() and list(ClosureTable()) == []
-    with pytest.raises(IndexError, match="closure 0 of 0"):
-        ClosureTable()[0]
