@@ -153,59 +153,6 @@ def test_invalid_returns_of_an_organized_cloud_are_dropped_with_their_times_and_
     assert np.array_equal(match.T_target_source, wanted.T_target_source)
 
 
-ROOM = np.random.default_rng(1).uniform(-8.0, 8.0, (400, 3)).round()  # points on planes
-
-
-def live(stamps_s, span_s=0.0, kind=sc.Odometry):
-    """What was given a scan at each of these stamps, its points measured over so many seconds."""
-    made = kind()
-    for stamp_s in stamps_s:
-        made.process(sc.Scan.of(ROOM, stamp_s, np.linspace(0.0, span_s, len(ROOM)) if span_s else None))
-    return made
-
-
-@pytest.mark.parametrize(
-    ("stamps_s", "span_s", "words"),
-    [
-        ([5.0, 5.0], 0.0, "stamp_s is 5.0+, that of the scan before 5.0+; wanted seconds that increase"),
-        ([5.0, 4.9], 0.0, "stamp_s is 4.9"),
-        (1e3 * np.arange(0.0, 0.5, 0.1), 0.0, "stamp_s grows by 100 from scan to scan.*1e-3"),
-        (1e9 * np.arange(0.0, 0.1, 0.02), 0.0, r"stamp_s grows by 2e\+07 from scan to scan.*nanoseconds: 1e-9"),
-        (
-            np.arange(0.0, 0.5, 0.1),
-            1.0,
-            "times_s spans 1 s, but scans follow each other within 0.1 s.*from 0 to 1",
-        ),
-        ([1.7e12], 0.0, "stamp_s is 17.*from milliseconds: 1e-3"),
-    ],
-)
-def test_stamps_and_times_that_cannot_be_seconds_are_refused(stamps_s, span_s, words):
-    for kind in (sc.Odometry, sc.Slam):
-        with pytest.raises(InputError, match=words):
-            live(stamps_s, span_s, kind)
-
-
-@pytest.mark.parametrize(
-    "stamps_s",
-    [
-        [0.0, 0.1, 0.2, 300.0, 300.1, 300.2],  # a gap of minutes
-        [0.0, 60.0, 75.0, 130.0],  # stop and go
-        [0.0, 0.02, 0.04, 0.3, 0.4],  # stamps on arrival, after a burst
-        [0.0, 0.001, 0.002, 0.003, 0.004, 0.1, 0.2],
-    ],
-)
-def test_gaps_and_bursts_are_stamps_too(stamps_s):
-    assert live(stamps_s, 0.05).scans == len(stamps_s)
-
-
-def test_a_scan_that_was_refused_is_forgotten():
-    odometry = live([0.0, 0.1])
-    for _ in range(2):
-        with pytest.raises(InputError, match="wanted seconds that increase"):
-            odometry.process(sc.Scan.of(ROOM, 0.1))
-    assert odometry.process(sc.Scan.of(ROOM, 0.2)).scan.index == 2
-
-
 def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path, monkeypatch):
     here(monkeypatch)
     compared = sc.compare(office, tmp_path / "compared", ["svd"])

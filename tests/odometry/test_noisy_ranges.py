@@ -5,9 +5,6 @@ import json
 import pytest
 
 import scanchain
-from scanchain.logs import open_log
-from scanchain.odometry import FrontEnd
-from scanchain.settings import load_settings
 from tests.support import made
 from tests.support.scenes import shared_data
 
@@ -28,15 +25,6 @@ def test_a_noisy_lidar_with_dropouts_in_an_office_is_neither_degenerate_nor_cont
     assert metrics["verdict"] == "trustworthy" and metrics["ground_truth"]["optimized"]["ate_rmse_m"] < most_m
     assert metrics["range_noise_m"] == pytest.approx(noise_m, rel=0.1)
     assert "lidar noise " in (path / "summary.txt").read_text()
-
-
-def test_noise_within_what_is_assumed_changes_nothing():
-    scans = list(open_log(made.log("office", seconds=3, noise_m=0.02)).scans())
-    front_end = FrontEnd(load_settings(2).config, None, 2)
-    located = [front_end.locate(scan) for scan in scans]
-    assert front_end.odometry.resolution.noise.sigma_m == pytest.approx(0.02, rel=0.1)
-    assert {each.noise_m for each in located} == {0.0}
-    assert front_end.odometry.local_map.voxels.size_m == 0.1
 
 
 def test_a_real_lidar_of_noisy_ranges_that_stands_still_does_not_move(tmp_path):

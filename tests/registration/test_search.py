@@ -5,23 +5,12 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig
-from scanchain.odometry.recovery import from_above
 from scanchain.registration import SearchGrid, VoxelMap, Wanted, Window, find, search
 from scanchain.registration.search import Search, upright_columns
 from tests.support import naive
+from tests.support.scenes import sloping_street, walls
 
 CELL_M = 0.25
-
-
-def walls(rng, count, side_m):
-    """Points along walls that run with the axes."""
-    lines = []
-    for _ in range(count):
-        start, axis = rng.uniform(0.0, side_m, 2), rng.integers(2)
-        line = np.tile(start, (20, 1))
-        line[:, axis] += np.linspace(0.0, 0.3 * side_m, 20)
-        lines.append(line)
-    return np.concatenate(lines)
 
 
 def scene(seed):
@@ -130,33 +119,9 @@ def test_in_an_empty_map_and_without_points_nothing_is_found():
     assert not find(np.empty((0, 2)), map_of(points), window, wanted)
 
 
-def street(rng):
-    """Points of a sloping ground of 80 x 80 m and of walls on it, dense in their height."""
-    ground = rng.uniform(-40.0, 40.0, (30_000, 2))
-    feet = walls(rng, 12, 60.0) - 30.0
-    high = np.repeat(feet, 12, axis=0)
-    ground, high = (np.column_stack([xy, 0.05 * xy[:, 0] - 1.7]) for xy in (ground, high))
-    high[:, 2] += np.tile(np.linspace(0.0, 4.0, 12), len(feet))
-    return ground, high
-
-
 def test_columns_stand_on_walls_and_not_on_the_ground():
-    ground, high = street(np.random.default_rng(3))
+    ground, high = sloping_street(np.random.default_rng(3))
     columns = upright_columns(np.concatenate([ground, high]), 1.0)
     assert len(upright_columns(ground, 1.0)) == len(upright_columns(np.empty((0, 3)), 1.0)) == 0
     away_m = np.linalg.norm(columns[:, None] - high[None, :, :2], axis=2).min(axis=1)
     assert len(columns) > 100 and away_m.max() < 1.0
-
-
-def test_a_scan_in_space_is_found_meters_away_and_turned():
-    ground, high = street(np.random.default_rng(4))
-    target = VoxelMap(3, LocalMapConfig())
-    target.insert(np.concatenate([ground, high]), lie.identity(3))
-    truth = lie.lift(lie.pose_2d(9.0, -5.0, 0.6))
-    truth[2, 3] = 0.45
-    scan = lie.transform(lie.inverse(truth), np.concatenate([ground[::3], high]))
-    window = Window(lie.identity(2), 15.0, 1.0)
-    first = next(from_above(scan, target, lie.identity(3), window, 60.0))
-    away_m, away_rad = lie.apart(truth, first)
-    assert away_m < 1.0 and away_rad < 0.1
-    assert not list(from_above(ground, target, lie.identity(3), window, 60.0))
