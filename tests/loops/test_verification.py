@@ -31,6 +31,13 @@ def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
     assert free_space_agreement(here, wall, lie.identity(3), 1.0) < 0.2
 
 
+def test_submaps_that_agree_too_little_about_free_space_are_rejected():
+    here = place_in_the_middle()
+    found = Verifier(configured(3)).submap(here, here, lie.identity(3), min_agreement=1.1)
+    assert found.agreement == pytest.approx(1.0, abs=0.02)
+    assert found.problem.cause == "free-space agreement < the limit for a recognized place (1.1)"
+
+
 def verified(points, changes=None, **options):
     """The verification of a scan in a room of 8 m, whose true pose is 0.3 m away from the initial one."""
     config, T = configured(2, changes), lie.pose_2d(0.3, 0.0, 0.0)
@@ -51,6 +58,7 @@ WITH_CROWD = np.vstack([square(4.0), np.random.default_rng(0).uniform(-1.0, 1.0,
         (WITH_CROWD, {}, {}, None),
         (WITH_CROWD, {}, {"alone": True}, "overlap < loops.min_overlap"),
         (WITH_CROWD, {"loops.min_overlap": 0.9}, {}, "overlap < loops.min_overlap"),
+        (0.8 * square(4.0), {}, {}, "no point has a correspondence in the map"),
         (CORRIDOR, {}, {}, "information < loops.min_information"),
         (CORRIDOR, {}, {"in_map": True}, "information < loops.min_information"),
         (square(4.0), {"loops.min_information": 0.9}, {}, "information < loops.min_information"),
