@@ -23,7 +23,8 @@ def test_a_submap_holds_keyframes_of_its_own_segment_alone():
     assert np.ptp(part.points()[:, 0]) == pytest.approx(30.0)
 
 
-def test_a_submap_holds_what_was_passed_within_its_radii_and_its_points_lie_within_one():
+@pytest.mark.parametrize("anchor", [38, 52])
+def test_a_submap_holds_what_was_passed_within_its_radii_and_its_points_lie_within_one(anchor):
     rng = np.random.default_rng(0)
     clouds = [rng.normal(0.0, 20.0, (200, 2)) for _ in range(60)]
     keyframes = [
@@ -32,9 +33,11 @@ def test_a_submap_holds_what_was_passed_within_its_radii_and_its_points_lie_with
     ]
     segments = Segments()
     segments.start(20)
-    submap = submap_around(keyframes, 38, 10.0, segments)
-    assert [each.index for each in submap.members] == [k for k in range(20, 60) if -20.0 <= 0.7 * (k - 38) < 10.0]
-    T_anchor_odom = lie.inverse(keyframes[38].T_odom_lidar)
+    submap = submap_around(keyframes, anchor, 10.0, segments)
+    assert [each.index for each in submap.members] == [
+        k for k in range(20, 60) if -20.0 <= 0.7 * (k - anchor) < 10.0
+    ]
+    T_anchor_odom = lie.inverse(keyframes[anchor].T_odom_lidar)
     seen = np.vstack([lie.transform(T_anchor_odom @ each.T_odom_lidar, each.points) for each in submap.members])
     np.testing.assert_allclose(submap.points(), seen[np.linalg.norm(seen, axis=1) < 10.0], atol=1e-9)
 
@@ -52,6 +55,19 @@ def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
     submaps = VoxelSubmaps(3, 5, configured(3).local_map, Segments())
     submap = submaps.around(0, [Keyframe(0, 0, 0, stored(points), T, 0.0, scale)], 0)
     assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
+
+
+def test_a_submap_of_a_map_has_twice_as_many_keyframes_the_nearest_ones_of_any_pass():
+    positions = np.array([(1.0 * (k % 30), 3.3 * (k // 30)) for k in range(60)])
+    points = np.array([[0.0, 0.0], [0.0, 0.01], [0.01, 0.0]])
+    keyframes = [
+        Keyframe(k, k, k, stored(points), lie.pose_2d(*xy, 0.0), 1.0 * k) for k, xy in enumerate(positions + 0.02)
+    ]
+    submaps = VoxelSubmaps(2, 5, configured(2).local_map, Segments())
+    submaps.add_map(keyframes)
+    seen = np.round(submaps.around(10, keyframes, 59).points() + positions[10], 1)
+    nearest = np.argsort(np.linalg.norm(positions - positions[10], axis=1), kind="stable")[:22]
+    assert sorted(map(tuple, seen)) == sorted(map(tuple, positions[nearest]))
 
 
 def test_a_submap_of_a_map_takes_no_more_memory_than_its_voxels():

@@ -79,6 +79,10 @@ def test_the_usual_interval_of_a_burst_is_replaced_once_most_of_the_last_ones_ar
     assert usual_s[3] == pytest.approx(0.0001) and usual_s[-1] == pytest.approx(0.1, rel=0.01)
 
 
+def test_intervals_shorter_than_any_lidars_show_a_gap_once_a_few_are_known():
+    assert [fed(0.001 * np.arange(count)).is_gap(1.0) for count in (2, 4, 5, 9)] == [False, False, True, True]
+
+
 def test_scans_without_stamps_are_predicted_by_the_times_of_the_log(office_drive):
     stamped = office_drive.tracked(changes=NO_WHEELS)
     unstamped = office_drive.tracked([replace(scan, stamp_ns=0) for scan in office_drive.scans], NO_WHEELS)

@@ -19,10 +19,10 @@ def at(x_m, dimension):
     return T
 
 
-def predicted(dimension, position, times_s, wheels=None):
+def predicted(dimension, position, times_s, wheels=None, lost=()):
     """The predictor after scans at x(t), which matches give exactly, and its prediction for the last of them.
 
-    wheels : readings x(t) of the wheels, where there are any
+    wheels : readings x(t) of the wheels, where there are any; lost : numbers of scans that are lost
     """
     config = configured(dimension)
     predictor = Predictor(config.odometry, lie.identity(dimension), is_mounted=True)
@@ -33,7 +33,7 @@ def predicted(dimension, position, times_s, wheels=None):
         prediction = predictor.predict(scan)
         if index + 1 < len(times_s):
             match = first_match(at(position(time_s), dimension), np.zeros((1000, dimension)), config.matching)
-            predictor.correct(scan, prediction, match, State.OK)
+            predictor.correct(scan, prediction, match, State.LOST if index in lost else State.OK)
     return predictor, prediction
 
 
@@ -60,6 +60,8 @@ def test_over_a_gap_the_motion_continues_as_a_guess_with_a_stop_among_the_other_
     assert found.is_guess and found.interval_s == pytest.approx(gap_s)
     np.testing.assert_allclose(found.T_odom_lidar, at(4.0 + 2.0 * gap_s, dimension), atol=1e-6)
     assert np.sqrt(found.prior.covariance[0, 0]) == pytest.approx(found.prior.widest[0])
+    _, after = predicted(dimension, evenly, [*EVENLY_S, 2.0 + gap_s, 2.1 + gap_s])
+    np.testing.assert_allclose(after.T_odom_lidar, at(evenly(2.1 + gap_s), dimension), atol=1e-6)
     others_m = sorted(T[0, -1] for T in found.alternatives())
     assert others_m == pytest.approx(4.0 + 2.0 * np.sort([0.0, 0.1, 0.5 * gap_s, gap_s, 1.5 * gap_s]))
 
@@ -77,12 +79,29 @@ def test_windows_grow_with_the_time_up_to_their_limits(dimension):
         assert [len(each) for each in windows] == [2, 2, 1, 1, 1] and widest[-1][0] == 30.0
 
 
+def test_lost_scans_continue_the_motion_in_wider_windows_and_cannot_refute_wheels(dimension):
+    sound, found = predicted(dimension, evenly, EVENLY_S)
+    doubtful, after_lost = predicted(dimension, evenly, EVENLY_S, lost=range(12, 20))
+    np.testing.assert_allclose(after_lost.T_odom_lidar, at(evenly(2.0), dimension), atol=1e-3)
+    assert (found.lost_s, after_lost.lost_s) == (0.0, pytest.approx(0.8))
+    assert np.min(after_lost.windows()) > np.min(found.windows())
+    jumped, _ = predicted(dimension, lambda time_s: evenly(time_s) + 1.5 * (time_s > 1.85), EVENLY_S)
+    assert [each.doubts_scans for each in (sound, doubtful, jumped)] == [False, True, True]
+
+
+def test_in_a_burst_of_stamps_a_velocity_is_computed_with_the_usual_interval():
+    _, found = predicted(3, evenly, [*EVENLY_S, 2.001])
+    assert found.interval_s == pytest.approx(0.001)
+    twist = found.scan_motion_by(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])).twist
+    np.testing.assert_allclose(twist, [2.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
+
+
 @pytest.mark.parametrize("before_s", [0.1, 0.06, 0.19, 0.04])
 def test_the_motion_during_a_scan_is_the_velocity_at_its_stamp_where_intervals_are_even_enough(before_s):
     def position(time_s):
         return 3.0 * time_s + time_s**2
 
-    _, found = predicted(3, position, [0.0, 1.0 - before_s, 1.0, 1.1])
+    _, found = predicted(3, position, [0.9 - before_s, 1.0 - before_s, 1.0, 1.1])
     way_m = position(1.1) - position(1.0)
     speed_m_s = 3.0 + 2.0 * 1.1 if before_s > 0.05 else way_m / 0.1
     twist = found.scan_motion_by(lie.log(at(way_m, 3))).twist
