@@ -9,7 +9,7 @@ from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Proposal
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import _OF_FIND as FOUND
-from scanchain.loops.evidence import SequentialPlaceTest
+from scanchain.loops.evidence import LARGEST_RATIO, SequentialPlaceTest, features, is_in_sight, log_ratio
 from scanchain.odometry.odometry import first_match
 from tests.support.graphs import graph_of
 from tests.support.scenes import configured, square, stored
@@ -149,3 +149,34 @@ def test_what_does_not_match_counts_against_a_log_only_where_the_map_shows_it(aw
     evidence.record(at_wrong)
     assert evidence.passes_at(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)) is holds
     assert np.isfinite(evidence.best) is np.bool_(holds)
+
+
+def test_a_rejected_place_forgets_what_was_tried_in_its_own_segment_alone():
+    evidence, _ = begun()
+    evidence.record(tried(1, 2, 3, 5))
+    evidence.reject(3)
+    assert sorted(evidence.tried) == [1, 2]
+
+
+def test_a_keyframe_is_in_sight_of_the_nearest_other_one_if_that_views_enough_of_its_points():
+    near, far, corner = keyframes_in([4.0] * 3, [0.5, 30.0, 0.0])[3:]
+    corner = replace(corner, stored=stored(square(4.0)[:120]))
+    assert is_in_sight(near, [corner]) is False  # of one that sees a seventh of the room
+    assert [is_in_sight(corner, others) for others in ([near], [far, near], [far])] == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("overlap", "agreeing", "contradicting", "expected"),
+    [
+        (1.0, 900, 0, (1.0, 0.0, 0.0)),
+        (0.65, 900, 0, (0.5, 0.5, 0.0)),
+        (0.2, 300, 600, (0.0, 1.0, 2.0 / 3.0)),
+        (0.2, 50, 50, (0.0, 0.5, 0.25)),  # hardly in view
+        (0.2, 0, 0, (0.0, 0.0, 0.0)),  # out of sight: it counts neither for nor against
+    ],
+)
+def test_a_keyframe_counts_by_its_fit_and_by_what_is_in_view(overlap, agreeing, contradicting, expected):
+    (closure,) = tried(3, overlap=overlap)
+    assert features(closure, agreeing, contradicting, 1000) == pytest.approx(expected)
+    ratio = log_ratio(closure, agreeing, contradicting, 1000)
+    assert ratio == pytest.approx(np.clip(np.dot([2.8, -0.4, -4.9], expected), -LARGEST_RATIO, LARGEST_RATIO))

@@ -17,9 +17,11 @@ def test_a_submap_holds_keyframes_of_its_own_segment_alone():
     keyframes = [Keyframe(k, k, k, stored(points), lie.pose_2d(10.0 * k, 0.0, 0.0), 1.0 * k) for k in range(8)]
     segments = Segments()
     whole = VoxelSubmaps(2, 5, configured(2).local_map, segments).around(5, keyframes, 7)
+    early = VoxelSubmaps(2, 5, configured(2).local_map, segments).around(5, keyframes, 6)
     segments.start(4)
     part = VoxelSubmaps(2, 5, configured(2).local_map, segments).around(5, keyframes, 7)
     assert np.ptp(whole.points()[:, 0]) == pytest.approx(70.0)
+    assert np.ptp(early.points()[:, 0]) == pytest.approx(60.0)
     assert np.ptp(part.points()[:, 0]) == pytest.approx(30.0)
 
 
