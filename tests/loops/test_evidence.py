@@ -9,7 +9,7 @@ from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Proposal
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import _OF_FIND as FOUND
-from scanchain.loops.evidence import LARGEST_RATIO, SequentialPlaceTest, features, is_in_sight, log_ratio
+from scanchain.loops.evidence import LARGEST_RATIO, SequentialPlaceTest, compared, features, is_in_sight, log_ratio
 from scanchain.odometry.odometry import first_match
 from tests.support.graphs import graph_of
 from tests.support.scenes import configured, square, stored
@@ -149,6 +149,30 @@ def test_what_does_not_match_counts_against_a_log_only_where_the_map_shows_it(aw
     evidence.record(at_wrong)
     assert evidence.passes_at(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)) is holds
     assert np.isfinite(evidence.best) is np.bool_(holds)
+
+
+def test_a_place_where_nothing_has_matched_for_fifty_meters_is_rejected():
+    keyframes = keyframes_in([4.0] * 8)
+    evidence, _ = begun()
+    evidence.update(tried(3), *up_to(3, keyframes))
+    assert [evidence.is_rejected(replace(keyframes[4], traveled_m=m)) for m in (52.5, 53.5)] == [False, True]
+
+
+def test_within_one_log_fewer_keyframes_pass_at_their_final_poses_and_another_place_brings_its_own():
+    keyframes = keyframes_in([4.0] * 8)
+    evidence, other = begun()[0], begun()[0]
+    other.record(tried(3, 4, 5))
+    evidence.continue_from(other)
+    passes = [evidence.passes_at(range(3, 6), *up_to(5, keyframes), of_same_log=same) for same in (True, False)]
+    assert passes == [True, False] and not begun()[0].passes_at(
+        range(3, 6), *up_to(5, keyframes), of_same_log=True
+    )
+
+
+def test_free_space_is_compared_with_the_nearest_keyframe_far_enough_along_the_path():
+    keyframes = keyframes_in([4.0, 9.0], [0.5, 0.0])[3:]  # the last one sees through the walls of the other
+    counts = [compared(keyframes[1:], keyframes, path_m).tolist() for path_m in (0.0, 1.0, 2.0)]
+    assert counts == [[800, 0], [0, 800], [0, 0]]
 
 
 def test_a_rejected_place_forgets_what_was_tried_in_its_own_segment_alone():
