@@ -64,12 +64,13 @@ def test_a_keyframe_is_closed_to_the_nearest_of_those_far_enough_back(off_m, is_
 
 
 def test_at_a_pose_in_a_map_the_newest_keyframe_is_closed_to_it_and_away_from_it_to_nothing():
-    keyframes, closer_ = keyframes_along(ALONG), LoopCloser(configured(2), 2)
-    closer_.add_map(keyframes[:3])
-    (closure,) = closer_.near.in_map_at(lie.pose_2d(0.3, 0.1, 0.05), keyframes)
-    assert (closure.target, closure.verdict) == (0, ClosureVerdict.ACCEPTED)
-    assert lie.apart(closure.match.T_target_source, lie.pose_2d(0.1, 0.0, 0.0))[0] < 0.01
-    assert closer_.near.in_map_at(lie.pose_2d(-1.1, 0.0, 0.0), keyframes) == ()
+    keyframes = keyframes_along([*((0.5 * k - 2.5, 0.5 * k) for k in range(11)), (2.3, 90.0)])
+    closer_ = LoopCloser(configured(2), 2)
+    closer_.add_map(keyframes[:11])
+    (closure,) = closer_.near.in_map_at(lie.pose_2d(2.45, 0.1, 0.05), keyframes)
+    assert (closure.target, closure.verdict) == (10, ClosureVerdict.ACCEPTED)
+    assert lie.apart(closure.match.T_target_source, lie.pose_2d(-0.2, 0.0, 0.0))[0] < 0.01
+    assert closer_.near.in_map_at(lie.pose_2d(3.6, 0.0, 0.0), keyframes) == ()
 
 
 def run(longer, turn_rad_m):
