@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from scanchain import InputError, Localizer, Trajectory, lie, localize, open_log, read_tum, write_tum
 from scanchain.config import LogConfig
-from scanchain.data import Keyframe, Scan
+from scanchain.data import Keyframe
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.runs.metrics import REASON
 from scanchain.sessions.localize import measure, pose_near
@@ -195,18 +195,6 @@ def test_what_cannot_be_localized_is_refused_and_leaves_the_map_as_it_was(office
 def test_a_log_of_another_dimension_than_the_map_is_refused(office, tmp_path):
     with pytest.raises(InputError, match="has 3D scans, the map map is 2D; give a map of the same kind"):
         localize(made.log("town", seconds=1), office / "map", tmp_path / "loc")
-
-
-def test_the_localizer_takes_scans_as_a_driver_has_them(office):
-    saved = open_saved_map(office / "map")
-    localizer = Localizer(office / "map", initial=saved.keyframes[0].T_odom_lidar)
-    first = saved.keyframes[0].points
-    placed = [localizer.process(Scan.of(first, 0.1 * k)) for k in range(5)]
-    assert all(each.state is not MapState.SEARCHING for each in placed)
-    off_m, off_rad = lie.apart(placed[-1].T_map_lidar, saved.keyframes[0].T_odom_lidar)
-    assert off_m < 0.01 and off_rad < 0.01 and placed[-1].covariance.shape == (3, 3)
-    with pytest.raises(InputError, match="stamp"):
-        localizer.process(Scan.of(first, 0.1))
 
 
 def test_a_position_and_heading_take_height_and_tilt_of_the_nearest_keyframe():

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from unittest.mock import create_autospec
 
 import numpy as np
@@ -10,16 +9,13 @@ import pytest
 
 import scanchain as sc
 from scanchain import lie
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Trajectory
+from scanchain.data import Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.loops.verification import Verifier
-from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
-from scanchain.odometry.odometry import first_match
+from scanchain.maps import open_saved_map, read_ply
 from scanchain.runs.job import Job, Progress
-from scanchain.sessions.joining import Joined, changed, graph_of, objection_to
-from scanchain.sessions.merged_map import session_names
 from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.maps import draw_run
@@ -127,12 +123,6 @@ def test_fixed_leaves_the_poses_of_the_first_run_to_the_bit_and_is_certified(run
     assert ate_m(out.path, truth, ("noon", "morning")) < 0.02
 
 
-def test_runs_of_equal_names_get_names_that_differ(runs):
-    folder, _ = runs
-    noon = open_saved_map(folder / "noon")
-    assert session_names([noon, noon], [1, 0]) == [["noon-2"], ["noon"]]
-
-
 def test_nothing_that_belongs_together_is_an_error_of_one_line_and_leaves_nothing(runs, call, tmp_path):
     folder, _ = runs
     code, output, said = call("merge", folder / "noon", folder / "stranger", "--out", tmp_path / "out")
@@ -214,40 +204,6 @@ def test_an_updated_map_is_localized_in_and_merged_further(runs, updates, tmp_pa
     assert [len(k.points) for k in np.array(after.keyframes)[kept]] == [len(k.points) for k in before.keyframes]
 
 
-def test_keyframes_held_as_one_pose_leave_the_cost_as_it_is(dimension):
-    rng = np.random.default_rng(3)
-    k = 3 if dimension == 2 else 6
-    poses = lie.exp(rng.normal(0.0, 1.0, (7, k)))
-    pairs = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 1), (2, 5), (0, 6)])
-    measured = lie.between(poses[pairs[:, 0]], poses[pairs[:, 1]]) @ lie.exp(rng.normal(0.0, 0.1, (9, k)))
-    roots = rng.normal(0.0, 1.0, (9, k, k))
-    information = roots @ np.swapaxes(roots, 1, 2) + np.eye(k)
-    edges = Edges(pairs, measured, information, np.zeros(9, np.bool_), np.ones(9))
-    keyframes = tuple(Keyframe(i, i, i, None, pose, float(i)) for i, pose in enumerate(poses))
-    joined = Joined((0, 1), keyframes, np.array([0, 0, 0, 1, 1, 1, 1]), edges)
-    held, whole = graph_of(joined, held=0), graph_of(joined)
-    assert len(held) == 5
-    inside = (pairs < 3).all(axis=1)
-    assert np.allclose(held.state().edge_chi2, whole.state().edge_chi2[~inside], rtol=1e-9)
-
-
-def _room(dimension, half_m):
-    """A keyframe in the middle of a square room, or of a cube."""
-    rays = np.random.default_rng(1).normal(size=(60_000, dimension))
-    points = half_m * rays / np.abs(rays).max(axis=1, keepdims=True)
-    return Keyframe(0, 0, 0, SavedPoints(points, 1.0), lie.identity(dimension), 0.0)
-
-
-def test_a_map_that_differs_from_those_it_joined_by_more_than_they_do_in_themselves_is_told(dimension):
-    def joined_with(half_m):
-        rooms = [_room(dimension, wide_m) for wide_m in (4.0, 4.0, half_m, half_m)]
-        keyframes = tuple(replace(room, index=k, traveled_m=100.0 * k) for k, room in enumerate(rooms))
-        return Joined((0, 1), keyframes, np.array([0, 0, 1, 1]), None)
-
-    assert changed(joined_with(4.0)) == {}
-    assert changed(joined_with(9.0))[1] > 0.3
-
-
 def test_a_join_without_enough_evidence_is_not_made_but_told_with_its_pose(runs, call, tmp_path, monkeypatch):
     folder, truth = runs
     evening = list(PARTS).index("evening")
@@ -274,39 +230,6 @@ def test_a_join_without_enough_evidence_is_not_made_but_told_with_its_pose(runs,
     assert code == 1
     assert "no two of the maps belong together for certain: noon might begin at" in said
     assert not (tmp_path / "two").exists()
-
-
-@pytest.mark.parametrize("repeats", [True, False])
-def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(repeats):
-    depths_m = np.random.default_rng(4).uniform(1.0, 3.0, 60)
-    if repeats:
-        depths_m = np.tile(depths_m[:5], 12)
-    path = [_corridor(float(x_m), index, depths_m) for index, x_m in enumerate(np.arange(20.0, 38.0, 0.5))]
-    count = len(path)
-    pairs = np.column_stack([np.arange(count), np.arange(count, 2 * count)])
-    eyes = np.tile(np.eye(3), (count, 1, 1))
-    edges = Edges(pairs, eyes, eyes, np.ones(count, np.bool_), np.ones(count))
-    keyframes = tuple(replace(each, index=k) for k, each in enumerate((*path, *path)))
-    config = sc.load_settings(2).config
-    match = first_match(lie.identity(2), np.empty((0, 2)), config.matching)
-    closures = tuple(Closure(i, j, match, 0.95, ClosureVerdict.ACCEPTED, "") for i, j in pairs.tolist())
-    joined = Joined((0, 1), keyframes, np.repeat([0, 1], count), edges, closures)
-    objection = objection_to(joined, count, config)
-    assert ("also fit other locations" in objection) == bool(objection) == repeats
-    few = replace(joined, edges=edges.where(pairs[:, 0] < 3))
-    assert "short path" in objection_to(few, count, config)
-
-
-def _corridor(x_m, index, depths_m):
-    """A keyframe in a corridor, one wall of which is as far away as said for every meter along it."""
-    angles = np.arange(-np.pi, np.pi, 0.01)
-    directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    ranges_m = np.arange(0.0, 10.0, 0.02)
-    along, across = x_m + ranges_m * directions[:, :1], ranges_m * directions[:, 1:]
-    is_wall = (across < -1.0) | (across > depths_m[np.clip(along, 0.0, 59.9).astype(int)])
-    seen = is_wall.any(axis=1)
-    points = ranges_m[is_wall.argmax(axis=1)][seen, None] * directions[seen]
-    return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
 
 
 @pytest.mark.slow

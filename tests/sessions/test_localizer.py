@@ -1,0 +1,66 @@
+"""Localization in a map scan by scan, as a driver delivers them, and at the end."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scanchain import InputError, Localizer, lie
+from scanchain.data import Scan
+from scanchain.maps import open_saved_map
+from scanchain.sessions.localizer import MapState
+from tests.support.rooms import BOX, hall, map_of, part, room, saved
+
+
+def test_the_localizer_takes_scans_as_a_driver_has_them(tmp_path):
+    prior = open_saved_map(saved(tmp_path / "room", part("room", room(BOX))))
+    localizer = Localizer(tmp_path / "room", initial=prior.keyframes[0].T_odom_lidar)
+    first = prior.keyframes[0].points
+    placed = [localizer.process(Scan.of(first, 0.1 * k)) for k in range(5)]
+    assert all(each.state is not MapState.SEARCHING for each in placed)
+    off_m, off_rad = lie.apart(placed[-1].T_map_lidar, prior.keyframes[0].T_odom_lidar)
+    assert off_m < 0.01 and off_rad < 0.01 and placed[-1].covariance.shape == (3, 3)
+    with pytest.raises(InputError, match="stamp"):
+        localizer.process(Scan.of(first, 0.1))
+
+
+def localized(solids):
+    """Scans of a drive along a room, placed in the map of one with a box, at once and in the end; true poses."""
+    prior, drive = map_of(Path("room"), part("room", room(BOX), count=12)), part("drive", solids, count=50)
+    localizer = Localizer(prior, is_live=False)
+    scans = [Scan.of(each.points, 0.1 * k, index=k) for k, each in enumerate(drive.keyframes)]
+    placed, found = [localizer.process(scan) for scan in scans], localizer.finish()
+    assert np.array_equal(found.result.graph.poses[:12], prior.poses)
+    assert [each.state for each in placed] == found.states.tolist()
+    return placed, found, drive.poses
+
+
+def test_scans_from_before_the_map_was_found_are_placed_in_the_end():
+    placed, found, true = localized(room(BOX))
+    first = found.found_at
+    assert 0 < first < 40 and found.is_placed.all()
+    assert np.isnan(found.live[:first]).all() and np.isnan(found.sigma_m[:first]).all()
+    assert np.array_equal(found.live[first:], [each.T_map_lidar for each in placed[first:]])
+    sigmas = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in placed[first:]]
+    assert np.allclose(found.sigma_m[first:], sigmas)
+    for poses, sigma_m in ((found.live, found.sigma_m), (found.trajectory.poses, found.final_sigma_m)):
+        error_m = np.linalg.norm((poses - true)[first:, :2, 2], axis=1)
+        assert 0.1 < np.median(error_m / sigma_m[first:]) < 3.0 and error_m.max() < 0.002
+    assert np.abs(found.traveled_m - (true[:, 0, 2] - 1.5)).max() < 0.01
+
+
+def test_nothing_is_placed_where_the_map_is_of_another_room():
+    placed, found, _ = localized(hall())
+    assert found.found_at == -1 and not found.is_placed.any() and len(found.placed) == 0
+    assert all(each.T_map_lidar is each.covariance is None for each in placed)
+    assert np.isnan(found.live).all() and np.isnan(found.final_sigma_m).all()
+
+
+def test_a_scan_of_which_nothing_matches_is_lost_and_its_pose_is_predicted():
+    prior = map_of(Path("room"), part("room", room(BOX), count=50))
+    localizer = Localizer(prior, initial=prior.poses[0])
+    seen = [each.points for each in prior.keyframes[:10]]
+    scans = [Scan.of(points, 0.1 * k) for k, points in enumerate([*seen, 0.05 * seen[-1][:60]])]
+    *_, known, lost = (localizer.process(scan) for scan in scans)
+    assert (known.state, lost.state) == (MapState.LOCALIZED, MapState.LOST)
+    assert lie.apart(lost.T_map_lidar, prior.poses[10])[0] < 0.01
