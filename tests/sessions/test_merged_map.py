@@ -20,7 +20,7 @@ NO_EDGES = Edges(np.empty((0, 2), int), *np.empty((2, 0, 3, 3)), np.empty(0, boo
 
 def test_runs_of_equal_names_get_names_that_differ():
     noon = map_of(Path("noon"), part("noon", room()))
-    assert session_names([noon, noon], [1, 0]) == [["noon-2"], ["noon"]]
+    assert session_names([noon, noon, noon], [1, 0, 2]) == [["noon-2"], ["noon"], ["noon-3"]]
 
 
 def test_sessions_are_in_the_frame_of_the_first_map_with_the_motion_of_their_scans_and_in_order_of_time(tmp_path):
