@@ -39,6 +39,8 @@ def test_scans_from_before_the_map_was_found_are_placed_in_the_end():
     placed, found, true = localized(room(BOX))
     first = found.found_at
     assert 0 < first < 40 and found.is_placed.all()
+    before_m = np.linalg.norm((found.trajectory.poses - true)[:first, :2, 2], axis=1)
+    assert (0.2 * before_m < found.final_sigma_m[:first]).all() and found.final_sigma_m[:first].max() < 0.01
     assert np.isnan(found.live[:first]).all() and np.isnan(found.sigma_m[:first]).all()
     assert np.array_equal(found.live[first:], [each.T_map_lidar for each in placed[first:]])
     sigmas = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in placed[first:]]
