@@ -21,7 +21,7 @@ from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, record, s
 from scanchain.simulation.motion import wheel_odometry
 from scanchain.simulation.sensors import take_sweep
 from scanchain.simulation.solids import FIXED, Solids
-from scanchain.simulation.worlds.indoor import CORRIDOR_M, CORRIDOR_SIGHT_M, CORRIDOR_STRUCTURE_M
+from scanchain.simulation.worlds.indoor import CORRIDOR, CORRIDOR_STRUCTURE_M
 from scanchain.trajectory import read_tum
 from tests.support import naive_raycast
 from tests.support.naive_logs import decoded
@@ -213,13 +213,13 @@ def seen_from(drive, index, twists):
 @pytest.mark.parametrize("sensor", LIDARS)
 def test_motion_along_the_middle_of_the_corridor_changes_no_range(sensor):
     drive, seen = planned("corridor", sensor), set()
-    bare_m = CORRIDOR_STRUCTURE_M + CORRIDOR_SIGHT_M + 0.5
+    bare_m = CORRIDOR_STRUCTURE_M + WORLDS["corridor"].sight_m + 0.5
     for scan in range(0, 400, 40):
         T, (here, along, across) = seen_from(drive, scan, np.eye(6)[[0, 0, 1]] * [[0.0], [0.5], [0.2]])
-        if bare_m < T[0, 3] < CORRIDOR_M - bare_m:
+        if bare_m < T[0, 3] < CORRIDOR.length_m - bare_m:
             assert np.allclose(along, here, atol=1e-9) and not np.allclose(across, here, atol=0.1)
             seen.add("middle")
-        elif T[0, 3] > CORRIDOR_M - 12.0:
+        elif T[0, 3] > CORRIDOR.length_m - 12.0:
             assert not np.allclose(along, here, atol=0.1)
             seen.add("end")
     assert seen == {"middle", "end"}

@@ -17,13 +17,12 @@ from scanchain.kernels.raycast import BOX, ELLIPSOID
 from scanchain.simulation.solids import FIXED, Solids
 
 _VANISHED, _MOVED, _APPEARED = 0.12, 0.15, 0.08  # shares of the objects removed, moved, and copied elsewhere
-_APART_M = (0.5, 4.0)  # distance of the move
+_APART_M = (0.5, 4.0)  # meters, range of the distance of a move: within sight of where the object stood
 _TURN_RAD = 0.15  # standard deviation of the turn, in addition to quarter turns
-_TRIES = 20
+_TRIES = 20  # number of poses sampled for an object; it stays as it is if none of them is free
 _ROOM_M = 0.05  # least distance from other solids
-_SAMPLE_M = 0.1  # spacing of the points of a footprint
-_NEAR_M = 8.0  # solids up to this far from an object can overlap with it
-_BELOW_M = 2.0  # solids that begin higher cannot overlap with an object
+_SAMPLE_M = 2.0 * _ROOM_M  # spacing of the points of a footprint: nothing is farther than ``_ROOM_M`` from one
+_HIGHEST_M = 2.0  # solids that begin higher above the ground, such as lintels, overlap with no object
 _COLUMNS = (
     *("kind", "x_before", "y_before", "z_before", "x_after", "y_after", "z_after"),
     *("length", "width", "height"),
@@ -117,10 +116,11 @@ def _is_free(thing: Solids, solids: Solids, path: Matrix, free_m: float) -> bool
 
 
 def _clearance_m(solids: Solids, xy: Matrix) -> float:
-    """Least distance of positions (N, 2) from nearby solids, inf if there are none."""
-    away_m = np.linalg.norm(solids.rows[:, 1:3] - xy.mean(axis=0), axis=1)
-    near = away_m < _NEAR_M + 1.5 * solids.rows[:, 3:5].max(axis=1)
-    return float(solids.part(near).clearance_m(xy, _BELOW_M).min())
+    """Least distance of positions (N, 2) from solids, inf if it is over ``_ROOM_M`` from all of them."""
+    middle = xy.mean(axis=0)
+    reach_m = np.linalg.norm(xy - middle, axis=1).max() + np.linalg.norm(solids.rows[:, 3:5], axis=1) + _ROOM_M
+    near = np.linalg.norm(solids.rows[:, 1:3] - middle, axis=1) < reach_m
+    return float(solids.part(near).clearance_m(xy, _HIGHEST_M).min())
 
 
 def _box(thing: Solids) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

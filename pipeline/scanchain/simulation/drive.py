@@ -23,14 +23,13 @@ from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds import WORLDS, World
 from scanchain.trajectory import write_tum
 
-EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
+EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan, in November 2023
 _PLACE, _DEVIATION, _WHEELS, _RANGES = range(4)  # each purpose has random numbers of its own
-_ODOMETRY_PERIOD_NS = 20_000_000
-_DROPOUT_S = 1.0
+_ODOMETRY_PERIOD_NS = 20_000_000  # 50 Hz, as of most robots' drivers
+_DROPOUT_S = 1.0  # seconds without scans at each of the dropouts of a world
 _PATH_STEP_S = 0.1  # between the positions of a drive that objects keep clear of
-_SPARE_M = 0.25  # their distance from it, beyond the vehicle's half width and deviation
-_LONGEST_S = 36_000.0
-_FARTHEST_M = 1e5
+_SPARE_M = 0.25  # distance of objects from the drive, beyond the vehicle's half width and deviation
+_LONGEST_S = 36_000.0  # longest drive, 10 h: the plan is in memory
 
 
 class Slip(NamedTuple):
@@ -98,7 +97,7 @@ def plan(
     length_s = scene.duration_s if duration_s is None else duration_s
     _check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
-    _check_range("start_m", start_m, 0.0, _FARTHEST_M)
+    _check_range("start_m", start_m, 0.0, checks.LARGEST)
     _check_range("drift", drift, 0.0, 100.0)
     start_s, end_s, size_m = wheels_slip
     if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):

@@ -19,11 +19,23 @@ from scanchain.simulation.solids import Solids
 
 _SWAY_HERTZ = np.array([1.3, 0.9, 1.1, 0.8, 0.6])  # heave, roll, pitch, sideways, heading
 
-_SCALE_SHARE = 0.01  # relative error of the distance: the wheels are not of the assumed size
-_TURN_SHARE = 0.02  # relative error of the angle: the wheels are not at the assumed distance
-_BIAS_RAD_PER_M = 0.0005  # turn per meter, because one wheel is larger than the other
-_NOISE_M = 0.01  # slip along the path, per √m
-_NOISE_RAD = 0.004  # slip in heading, per √m
+
+class WheelErrors(NamedTuple):
+    """Errors of wheel odometry, as of a robot with differential drive that was never calibrated.
+
+    scale, turn : relative errors of distance and angle: the wheels' assumed size and distance are wrong
+    bias_rad_per_m : turn per meter, because one wheel is larger than the other
+    noise_m, noise_rad : slip along the path and in heading, standard deviations per √m
+    """
+
+    scale: float = 0.01
+    turn: float = 0.02
+    bias_rad_per_m: float = 0.0005
+    noise_m: float = 0.01
+    noise_rad: float = 0.004
+
+
+_WHEELS = WheelErrors()
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +143,12 @@ def wheel_odometry(
     traveled = np.linalg.norm(steps[:, :2, 2], axis=1)
     scale, turn, bias = drift * rng.choice([-1.0, 1.0], 3) * rng.uniform(0.5, 1.5, 3)
     noise = drift * np.sqrt(traveled)[:, None] * rng.standard_normal((len(steps), 2))
-    moved = steps[:, :2, 2] * (1.0 + scale * _SCALE_SHARE)
-    moved[:, 0] += _NOISE_M * noise[:, 0] + slips_m
+    moved = steps[:, :2, 2] * (1.0 + scale * _WHEELS.scale)
+    moved[:, 0] += _WHEELS.noise_m * noise[:, 0] + slips_m
     turned = (
-        lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * traveled + _NOISE_RAD * noise[:, 1]
+        lie.yaw(steps) * (1.0 + turn * _WHEELS.turn)
+        + bias * _WHEELS.bias_rad_per_m * traveled
+        + _WHEELS.noise_rad * noise[:, 1]
     )
     poses = lie.exp(np.outer(np.concatenate([[0.0], np.cumsum(turned)]), [0.0, 0.0, 1.0]))  # at the origin
     c, s = poses[:-1, 0, 0], poses[:-1, 1, 0]
@@ -143,17 +157,26 @@ def wheel_odometry(
     return poses
 
 
-_HOLD_S = 1.0  # standstill before the start, as long as the smoothing extends
-_STEP_S = 0.02  # spacing of the speed profile
-_EASE_S = 0.25  # standard deviation of the smoothing that makes the acceleration continuous
-_MARGIN_S = 2.0  # the profile extends this far beyond both ends of the drive
+class Profile(NamedTuple):
+    """Sampling of a speed profile: spacing, and standard deviation of the smoothing that makes it continuous."""
 
-TURN_RAD_S = np.deg2rad(120.0)
-_TURN_RAD_S2 = np.deg2rad(400.0)
-_PIVOT_STEP_S = 0.005  # spacing of the profiles
-_PIVOT_EASE_S = 0.05  # standard deviation of the smoothing that makes the accelerations continuous
-_PAUSE_S = 0.4  # between a turn and a move, as long as the smoothing extends on both sides
-_FIRST_PAUSE_S = 1.0  # standstill at the beginning
+    step_s: float
+    ease_s: float
+
+    @property
+    def extent_s(self) -> float:
+        """How far the smoothing extends: gaussian_filter1d stops at four standard deviations."""
+        return 4.0 * self.ease_s
+
+    def eased(self, speeds: Matrix) -> Matrix:
+        """The smoothed speeds."""
+        return np.asarray(gaussian_filter1d(speeds, self.ease_s / self.step_s, axis=0))
+
+
+_LAPS, _PIVOTS = Profile(step_s=0.02, ease_s=0.25), Profile(step_s=0.005, ease_s=0.05)
+_HOLD_S = _LAPS.extent_s  # standstill before the start
+_MARGIN_S = 2.0 * _HOLD_S  # a profile extends this far beyond both ends of the drive
+TURN_RAD_S, _TURN_RAD_S2 = np.deg2rad(120.0), np.deg2rad(400.0)  # limits of a turn on the spot
 
 
 class Lap:
@@ -239,10 +262,10 @@ def _drive(position: BSpline, arc_m: NDArray[np.float64], vehicle: Vehicle, dura
     energy = (np.minimum.accumulate((energy + gain)[::-1]))[::-1] - gain
     speed = np.sqrt(np.maximum(energy, 0.0))
     taken_s = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(arc_m) / (speed[1:] + speed[:-1]))])
-    times_s = np.arange(-_MARGIN_S, duration_s + _MARGIN_S, _STEP_S)
+    times_s = np.arange(-_MARGIN_S, duration_s + _MARGIN_S, _LAPS.step_s)
     begun_s = times_s - _HOLD_S - vehicle.standstill_s
-    eased = gaussian_filter1d(np.interp(begun_s, taken_s, speed), _EASE_S / _STEP_S)
-    reached_m = cumulative_trapezoid(eased, dx=_STEP_S, initial=0.0)
+    eased = _LAPS.eased(np.interp(begun_s, taken_s, speed))
+    reached_m = cumulative_trapezoid(eased, dx=_LAPS.step_s, initial=0.0)
     return make_interp_spline(times_s, reached_m, k=3)
 
 
@@ -262,14 +285,13 @@ def pivots(
     moves = [_trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2) for step in steps]
     pairs = zip(turns, moves, strict=True)  # one after the other
     lap = np.vstack([np.asarray(block_diag(turn[:, None], move[:, None])) for turn, move in pairs])
-    rounds = int((duration_s + 2.0) / (len(lap) * _PIVOT_STEP_S)) + 1
-    rates = np.vstack([np.zeros((round(_FIRST_PAUSE_S / _PIVOT_STEP_S), 2)), *[lap] * rounds])
-    eased = np.asarray(gaussian_filter1d(rates, _PIVOT_EASE_S / _PIVOT_STEP_S, axis=0))
-    turning, moving = eased[:, 0], eased[:, 1]
-    instants_s = np.arange(len(rates)) * _PIVOT_STEP_S
-    turned = cumulative_trapezoid(turning, dx=_PIVOT_STEP_S, initial=0.0)
+    rounds = int((duration_s + _MARGIN_S) / (len(lap) * _PIVOTS.step_s)) + 1
+    rates = np.vstack([np.zeros((round(_HOLD_S / _PIVOTS.step_s), 2)), *[lap] * rounds])
+    turning, moving = _PIVOTS.eased(rates).T
+    instants_s = np.arange(len(rates)) * _PIVOTS.step_s
+    turned = cumulative_trapezoid(turning, dx=_PIVOTS.step_s, initial=0.0)
     velocity = moving[:, np.newaxis] * np.column_stack([np.cos(turned), np.sin(turned)])
-    moved = cumulative_trapezoid(velocity, dx=_PIVOT_STEP_S, axis=0, initial=0.0)
+    moved = cumulative_trapezoid(velocity, dx=_PIVOTS.step_s, axis=0, initial=0.0)
     heading, place = (make_interp_spline(instants_s, values, k=3) for values in (turned, moved))
 
     def course(times_s: NDArray[np.floating]) -> Course:
@@ -281,12 +303,12 @@ def pivots(
 
 
 def _trapezoid(distance: float, limit: float, acceleration: float) -> NDArray[np.float64]:
-    """Speeds, ``_PIVOT_STEP_S`` apart, that cover the distance within both limits; then a pause."""
+    """Speeds, ``_PIVOTS.step_s`` apart, that cover the distance within both limits; then a pause."""
     peak = min(limit, np.sqrt(abs(distance) * acceleration))
     if peak == 0.0:
         return np.zeros(0)
     taken_s = abs(distance) / peak + peak / acceleration
-    times_s = np.arange(0.0, taken_s, _PIVOT_STEP_S)
+    times_s = np.arange(0.0, taken_s, _PIVOTS.step_s)
     speed = np.minimum(peak, acceleration * np.minimum(times_s, taken_s - times_s))
-    speed *= distance / (np.sum(speed) * _PIVOT_STEP_S)
-    return np.concatenate([speed, np.zeros(round(_PAUSE_S / _PIVOT_STEP_S))])
+    speed *= distance / (np.sum(speed) * _PIVOTS.step_s)
+    return np.concatenate([speed, np.zeros(round(2.0 * _PIVOTS.extent_s / _PIVOTS.step_s))])

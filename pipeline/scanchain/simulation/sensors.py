@@ -86,7 +86,7 @@ def _rosette(count: int, period_ns: int) -> Callable[[int], Rays]:
     return rays
 
 
-_TENTH_S = 100_000_000  # ns
+_TENTH_S = 100_000_000  # ns, the period of a lidar at 10 Hz
 _HDL64_DEG = np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
 
 SENSORS: dict[str, Sensor] = {

@@ -14,7 +14,7 @@ from scanchain.kernels.raycast import BOX, CYLINDER, ELLIPSOID, SECTORS, cast_ra
 
 Pair = tuple[float, float]
 FLAT = np.zeros(7)
-FIXED = -1  # owner of solids that belong to no movable object
+FIXED = -1  # the owner of solids that belong to no movable object
 
 
 @dataclass(frozen=True, slots=True)

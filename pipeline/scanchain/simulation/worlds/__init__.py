@@ -19,7 +19,7 @@ class World:
 
     build : builds the solids with random numbers
     route : the closed route driven, (W, 2) along the ground or (W, 3) with given heights, or turns and moves
-    sight_m : visibility, an upper limit of any lidar's range
+    sight_m : visibility in dust or haze, an upper limit of any lidar's range
     dropouts : positions (x, y) in meters; for 1 s around the first pass of each, no scans are recorded
     """
 
@@ -32,21 +32,21 @@ class World:
     dropouts: tuple[tuple[float, float], ...] = ()
 
 
-_GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing where the car turns, the middle of a street
-
 WORLDS: dict[str, World] = {
     "office": World(indoor.office, indoor.OFFICE_ROUTE, indoor.OFFICE_ROBOT, "lms-270", 240.0),
     "town": World(outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 60.0),
     "rounds": World(outdoor.rounds, outdoor.ROUNDS_ROUTE, outdoor.ROUNDS_CAR, "hdl-64", 160.0),
     "identical": World(indoor.identical, indoor.IDENTICAL_ROUTE, indoor.OFFICE_ROBOT, "lms-270", 300.0),
     "highway": World(outdoor.highway, outdoor.HIGHWAY_ROUTE, outdoor.HIGHWAY_CAR, "hdl-64", 30.0),
-    "corridor": World(
-        indoor.corridor, indoor.CORRIDOR_ROUTE, indoor.CORRIDOR_ROBOT, "os1-32", 40.0, indoor.CORRIDOR_SIGHT_M
+    "corridor": World(  # in the dust, neither end can be seen from the middle
+        indoor.corridor, indoor.CORRIDOR_ROUTE, indoor.CORRIDOR_ROBOT, "os1-32", 40.0, sight_m=20.0
     ),
-    "field": World(outdoor.field, outdoor.FIELD_ROUTE, outdoor.TRACTOR, "hdl-64", 40.0, outdoor.FIELD_SIGHT_M),
+    "field": World(outdoor.field, outdoor.FIELD_ROUTE, outdoor.TRACTOR, "hdl-64", 40.0, sight_m=60.0),
     "forest": World(outdoor.forest, outdoor.FOREST_ROUTE, outdoor.MULE, "os1-32", 30.0),
     "staircase": World(indoor.staircase, indoor.STAIRCASE_ROUTE, indoor.WALKER, "os1-32", 40.0),
     "hall": World(indoor.hall, indoor.HALL_ROUTE, indoor.TRUCK, "vlp-16", 25.0),
     "turns": World(outdoor.yard, outdoor.YARD_STEPS, outdoor.YARD_ROBOT, "os1-32", 40.0),
-    "gap": World(outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 30.0, dropouts=_GAPS),
+    "gap": World(  # at a crossing where the car turns, and in the middle of a street
+        outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 30.0, dropouts=((0.0, 40.0), (25.0, 0.0))
+    ),
 }

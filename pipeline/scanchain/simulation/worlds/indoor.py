@@ -17,14 +17,23 @@ from scanchain.data import Matrix
 from scanchain.simulation.motion import Vehicle, mount, sampled
 from scanchain.simulation.solids import Scenery, Solids
 
+
+class Room(NamedTuple):
+    """A room: inner length along x and width along y, height, and thickness of the walls, meters."""
+
+    length_m: float
+    width_m: float
+    height_m: float
+    wall_m: float
+
+
 # walls with doorways, and furniture where it fits
 
-_CEILING_M = 2.8
-_WALL_M, _DOOR_M = 0.12, 1.0
+_CEILING_M, _WALL_M = 2.8, 0.12  # height of rooms and thickness of their walls, meters
+_DOOR_M = 1.0  # width of a doorway, and the distance from it that is kept free for its leaf
 _ROUTE_M = 0.5  # distance from the robot's route that is kept free
-_DOORWAY_M = 1.0  # distance from a doorway that is kept free
-_TRIES = 12
-_SIZES_M = {
+_TRIES = 12  # number of positions sampled for a piece of furniture
+_SIZES_M = {  # length and width of its footprint
     "shelf": (1.2, 0.35),
     "desk": (1.6, 1.5),  # with its chair
     "bin": (0.3, 0.3),
@@ -107,7 +116,7 @@ def _is_free(center: Matrix, half: Matrix, taken: list[Matrix], route: Matrix, d
     """True if an axis-aligned rectangle overlaps no other one and leaves the route and the doorways free."""
     if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in taken):
         return False
-    kept_free = ((route, _ROUTE_M), (doors, _DOORWAY_M))
+    kept_free = ((route, _ROUTE_M), (doors, _DOOR_M))
     outside = ((np.maximum(np.abs(places - center) - half, 0.0), limit_m) for places, limit_m in kept_free)
     return all(np.linalg.norm(each, axis=1).min() >= limit_m for each, limit_m in outside)
 
@@ -202,10 +211,11 @@ def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
 
 # the identical floor
 
-_ROOMS_A_SIDE, _ROOM_M, _ROOM_DEPTH_M = 8, 5.0, 6.0  # on each side of a corridor, along it and across it
-_FLOOR_M = _ROOMS_A_SIDE * _ROOM_M
+_ROOMS_A_SIDE = 8  # number of rooms on each side of a corridor
+_ROOM = Room(5.0, 6.0, _CEILING_M, _WALL_M)
+_FLOOR_M = _ROOMS_A_SIDE * _ROOM.length_m
 _AISLE_HALF_M = 1.0  # half the width of a corridor
-_CORRIDORS_Y_M = (0.0, 14.0, 28.0)  # their middles; rooms lie back to back between them
+_CORRIDORS_Y_M = np.arange(3) * 2.0 * (_AISLE_HALF_M + _ROOM.width_m)  # middles; rooms lie back to back in between
 _WEST_M, _EAST_M = -_AISLE_HALF_M, _FLOOR_M + _AISLE_HALF_M  # middles of the two corridors that join them
 
 # Along each corridor and through rooms of each, back through the first one, and through two rooms to the start.
@@ -229,19 +239,19 @@ def identical(rng: np.random.Generator) -> Solids:
     scenery = Scenery()
     middle = (0.5 * _FLOOR_M, _CORRIDORS_Y_M[1])
     scenery.box(middle, (_FLOOR_M + 6.0, 46.0), (_CEILING_M, _CEILING_M + 0.2))
-    doors = tuple((room + 0.5) * _ROOM_M for room in range(_ROOMS_A_SIDE))
+    doors = tuple((room + 0.5) * _ROOM.length_m for room in range(_ROOMS_A_SIDE))
     for y, side in product(_CORRIDORS_Y_M, (-1.0, 1.0)):
-        near, far = y + side * _AISLE_HALF_M, y + side * (_AISLE_HALF_M + _ROOM_DEPTH_M)
+        near, far = y + side * _AISLE_HALF_M, y + side * (_AISLE_HALF_M + _ROOM.width_m)
         walls = [Wall(0.0, near, _FLOOR_M, near, doors), Wall(0.0, far, _FLOOR_M, far)]
         for room in range(_ROOMS_A_SIDE + 1):
-            x, is_between = room * _ROOM_M, 0 < room < _ROOMS_A_SIDE
-            walls.append(Wall(x, near, x, far, (0.5 * _ROOM_DEPTH_M,) if is_between else ()))
+            x, is_between = room * _ROOM.length_m, 0 < room < _ROOMS_A_SIDE
+            walls.append(Wall(x, near, x, far, (0.5 * _ROOM.width_m,) if is_between else ()))
         for wall in walls:
             build_wall(scenery, wall, rng)
         for door in doors:  # rooms on the two sides of a corridor are turned by 180°
             for u, v, length, width, height in furniture:
                 with scenery.movable():
-                    center = (door + side * u, y + side * (_AISLE_HALF_M + 0.5 * _ROOM_DEPTH_M) + side * v)
+                    center = (door + side * u, y + side * (_AISLE_HALF_M + 0.5 * _ROOM.width_m) + side * v)
                     scenery.box(center, (length, width), (0.0, height), 0.0 if side > 0.0 else np.pi)
     south, north = _CORRIDORS_Y_M[0] - _AISLE_HALF_M, _CORRIDORS_Y_M[-1] + _AISLE_HALF_M
     for inner, outer in ((0.0, 2.0 * _WEST_M), (_FLOOR_M, _FLOOR_M + 2.0 * _AISLE_HALF_M)):
@@ -253,11 +263,8 @@ def identical(rng: np.random.Generator) -> Solids:
 
 # the corridor
 
-CORRIDOR_M = 80.0
-CORRIDOR_SIGHT_M = 20.0  # range limit by dust in the air: neither end can be seen from the middle
+CORRIDOR, _LOBBY = Room(80.0, 3.0, 2.7, 0.3), Room(9.0, 9.0, 2.7, 0.3)
 CORRIDOR_STRUCTURE_M = 5.0  # length at either end of the corridor where its walls are not bare
-_CORRIDOR_HALF_M, _CORRIDOR_HEIGHT_M, _CORRIDOR_WALL_M = 1.5, 2.7, 0.3
-_LOBBY_M, _LOBBY_HALF_M = 9.0, 4.5
 
 CORRIDOR_ROBOT = Vehicle(
     speed_m_s=2.5, acceleration_m_s2=0.8, lateral_acceleration_m_s2=0.8, corner_m=0.7, deviation_m=0.08,
@@ -274,18 +281,18 @@ CORRIDOR_ROUTE = np.array([
 def corridor(rng: np.random.Generator) -> Solids:
     """The corridor along x from 0 to 80 m; what stands in the lobbies and at the ends is sampled from ``rng``."""
     scenery = Scenery()
-    middle, span = 0.5 * CORRIDOR_M, CORRIDOR_M + 2.0 * _LOBBY_M + 2.0
-    scenery.box((middle, 0.0), (span, 2.0 * _LOBBY_HALF_M + 2.0), (_CORRIDOR_HEIGHT_M, _CORRIDOR_HEIGHT_M + 0.3))
+    length, width, height, wall = CORRIDOR
+    middle, span = 0.5 * length, length + 2.0 * _LOBBY.length_m + 2.0
+    scenery.box((middle, 0.0), (span, _LOBBY.width_m + 2.0), (height, height + 0.3))
     for side in (-1.0, 1.0):
-        y = side * (_CORRIDOR_HALF_M + 0.5 * _CORRIDOR_WALL_M)
-        scenery.box((middle, y), (CORRIDOR_M, _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M))
-    for end, outwards in ((0.0, -1.0), (CORRIDOR_M, 1.0)):
+        scenery.box((middle, side * 0.5 * (width + wall)), (length, wall), (0.0, height))
+    for end, outwards in ((0.0, -1.0), (length, 1.0)):
         _lobby(scenery, end, outwards, rng)
         for place in rng.uniform([0.5, 2.0, 3.5], [1.5, 3.0, CORRIDOR_STRUCTURE_M - 0.2]):
             size = (rng.uniform(0.1, 0.3), rng.uniform(0.05, 0.2))
             for side in (-1.0, 1.0):
-                center = (float(end - outwards * place), side * (_CORRIDOR_HALF_M - 0.5 * size[1]))
-                scenery.box(center, size, (0.0, _CORRIDOR_HEIGHT_M))
+                center = (float(end - outwards * place), side * 0.5 * (width - size[1]))
+                scenery.box(center, size, (0.0, height))
     return scenery.finish()
 
 
@@ -294,34 +301,30 @@ def _lobby(scenery: Scenery, end: float, outwards: float, rng: np.random.Generat
 
     The corridor opens in the middle of the wall at x = ``end``.
     """
-    far = end + outwards * (_LOBBY_M + 0.5 * _CORRIDOR_WALL_M)
-    scenery.box(
-        (far, 0.0), (_CORRIDOR_WALL_M, 2.0 * _LOBBY_HALF_M + 2.0 * _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M)
-    )
+    length, width, height, wall = _LOBBY
+    scenery.box((end + outwards * (length + 0.5 * wall), 0.0), (wall, width + 2.0 * wall), (0.0, height))
     for side in (-1.0, 1.0):
-        y = side * (_LOBBY_HALF_M + 0.5 * _CORRIDOR_WALL_M)
-        scenery.box((end + outwards * 0.5 * _LOBBY_M, y), (_LOBBY_M, _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M))
-        width = _LOBBY_HALF_M - _CORRIDOR_HALF_M
-        center = (end - outwards * 0.5 * _CORRIDOR_WALL_M, side * (_CORRIDOR_HALF_M + 0.5 * width))
-        scenery.box(center, (_CORRIDOR_WALL_M, width), (0.0, _CORRIDOR_HEIGHT_M))
+        scenery.box((end + outwards * 0.5 * length, side * 0.5 * (width + wall)), (length, wall), (0.0, height))
+        beside = 0.5 * (width - CORRIDOR.width_m)
+        center = (end - outwards * 0.5 * wall, side * 0.5 * (CORRIDOR.width_m + beside))
+        scenery.box(center, (wall, beside), (0.0, height))
     for depth in (1.2, 3.5, 5.8):
         for side in (-1.0, 1.0):
             size = (rng.uniform(0.6, 1.8), rng.uniform(0.3, 0.7))
             x = end + outwards * (depth + rng.uniform(-0.2, 0.2))
-            scenery.box((x, side * (_LOBBY_HALF_M - 0.5 * size[1])), size, (0.0, rng.uniform(0.45, 2.1)))
+            scenery.box((x, side * 0.5 * (width - size[1])), size, (0.0, rng.uniform(0.45, 2.1)))
     for y in (-2.5, rng.uniform(-0.5, 0.5), 2.5):
         size = (rng.uniform(0.3, 0.8), rng.uniform(0.5, 1.6))
-        x = end + outwards * (_LOBBY_M - 0.5 * size[0])
+        x = end + outwards * (length - 0.5 * size[0])
         scenery.box((x, y + rng.uniform(-0.3, 0.3)), size, (0.0, rng.uniform(0.5, 2.2)))
     for side in (-1.0, 1.0):
-        corner = (end + outwards * (_LOBBY_M - 0.4), side * (_LOBBY_HALF_M - 0.4))
+        corner = (end + outwards * (length - 0.4), side * (0.5 * width - 0.4))
         scenery.cylinder(corner, rng.uniform(0.15, 0.25), (0.0, rng.uniform(0.4, 1.8)))
 
 
 # the hall
 
-_HALL_LENGTH_M, _HALL_WIDTH_M, _HALL_HEIGHT_M, _HALL_WALL_M = 60.0, 40.0, 9.0, 0.4
-_PILLARS = ((15.0, 20.0), (30.0, 20.0), (45.0, 20.0))
+_HALL = Room(60.0, 40.0, 9.0, 0.4)
 
 TRUCK = Vehicle(
     speed_m_s=5.0, acceleration_m_s2=5.0, lateral_acceleration_m_s2=4.0, corner_m=6.5, deviation_m=0.3,
@@ -334,29 +337,46 @@ HALL_ROUTE = np.array([[12.0, 9.0], [51.0, 9.0], [51.0, 31.0], [9.0, 31.0], [9.0
 def hall(rng: np.random.Generator) -> Solids:
     """Walls, ceiling, three pillars in a row and four stacks of pallets sampled from ``rng``."""
     scenery = Scenery()
-    middle = (0.5 * _HALL_LENGTH_M, 0.5 * _HALL_WIDTH_M)
-    scenery.box(middle, (_HALL_LENGTH_M + 2.0, _HALL_WIDTH_M + 2.0), (_HALL_HEIGHT_M, _HALL_HEIGHT_M + 0.3))
+    length, width, height, wall = _HALL
+    middle = (0.5 * length, 0.5 * width)
+    scenery.box(middle, (length + 2.0, width + 2.0), (height, height + 0.3))
     for side in (0.0, 1.0):
-        outside = (2.0 * side - 1.0) * 0.5 * _HALL_WALL_M
-        along, across = (_HALL_LENGTH_M + 2.0 * _HALL_WALL_M, _HALL_WALL_M), (_HALL_WALL_M, _HALL_WIDTH_M)
-        scenery.box((middle[0], side * _HALL_WIDTH_M + outside), along, (0.0, _HALL_HEIGHT_M))
-        scenery.box((side * _HALL_LENGTH_M + outside, middle[1]), across, (0.0, _HALL_HEIGHT_M))
-    for x, y in _PILLARS:
-        scenery.box((x, y), (0.6, 0.6), (0.0, _HALL_HEIGHT_M))
+        outside = (2.0 * side - 1.0) * 0.5 * wall
+        scenery.box((middle[0], side * width + outside), (length + 2.0 * wall, wall), (0.0, height))
+        scenery.box((side * length + outside, middle[1]), (wall, width), (0.0, height))
+    for x in (15.0, 30.0, 45.0):
+        scenery.box((x, middle[1]), (0.6, 0.6), (0.0, height))
     for x in rng.uniform([3.0, 22.0, 36.0, 54.0], [6.0, 27.0, 40.0, 57.0]):
-        y = float(rng.choice([1.0, _HALL_WIDTH_M - 1.0]))
+        y = float(rng.choice([1.0, width - 1.0]))
         scenery.box((float(x), y), (rng.uniform(1.2, 3.6), 1.2), (0.0, rng.uniform(0.6, 2.2)))
     return scenery.finish()
 
 
 # the stairwell
 
-_FLIGHTS, _STEPS_A_FLIGHT = 8, 10
-_TREAD_M, _RISE_M = 0.29, 0.17
-_RUN_M, _FLIGHT_M = _STEPS_A_FLIGHT * _TREAD_M, _STEPS_A_FLIGHT * _RISE_M
-_LANE_M, _STAIR_HALF_M, _LANDING_M = 0.8, 1.6, 1.7  # offset of a flight, half the width, depth of a landing
-_TOP_M = _FLIGHTS * _FLIGHT_M
-_ROOF_M = _TOP_M + 2.8
+
+class Stairs(NamedTuple):
+    """Stairs whose flights turn back at each landing.
+
+    flights, steps : numbers of flights, and of steps of each
+    tread_m, rise_m : depth and height of a step
+    half_m : half the inner width of the stairwell, in which a flight takes one half
+    landing_m : depth of a landing along the flights
+    """
+
+    flights: int = 8
+    steps: int = 10
+    tread_m: float = 0.29
+    rise_m: float = 0.17
+    half_m: float = 1.6
+    landing_m: float = 1.7
+
+
+_STAIRS = Stairs()
+_RUN_M, _FLIGHT_M = _STAIRS.steps * _STAIRS.tread_m, _STAIRS.steps * _STAIRS.rise_m
+_LANE_M = 0.5 * _STAIRS.half_m  # offset of the middle of a flight
+_TOP_M = _STAIRS.flights * _FLIGHT_M
+_ROOF_M = _TOP_M + _CEILING_M
 
 WALKER = Vehicle(
     speed_m_s=0.8, acceleration_m_s2=0.8, lateral_acceleration_m_s2=0.5, corner_m=0.3, deviation_m=0.05,
@@ -367,7 +387,7 @@ WALKER = Vehicle(
 def _staircase_route() -> Matrix:
     """Up all flights, around on the top landing, down again, and around on the ground; heights of the feet."""
     up = []
-    for flight in range(_FLIGHTS):
+    for flight in range(_STAIRS.flights):
         y = -_LANE_M if flight % 2 == 0 else _LANE_M
         first, last = (0.0, _RUN_M) if flight % 2 == 0 else (_RUN_M, 0.0)
         outside = 0.75 if flight % 2 == 0 else -0.75
@@ -384,33 +404,33 @@ STAIRCASE_ROUTE = _staircase_route()
 
 def staircase(rng: np.random.Generator) -> Solids:
     """The stairwell: flights along x, landings at either end; doors, radiators and pipes sampled from ``rng``."""
-    scenery, middle, length = Scenery(), 0.5 * _RUN_M, _RUN_M + 2.0 * _LANDING_M
-    scenery.box((middle, 0.0), (length + 1.0, 2.0 * _STAIR_HALF_M + 1.0), (_ROOF_M, _ROOF_M + 0.2))
+    scenery, middle, length = Scenery(), 0.5 * _RUN_M, _RUN_M + 2.0 * _STAIRS.landing_m
+    scenery.box((middle, 0.0), (length + 1.0, 2.0 * _STAIRS.half_m + 1.0), (_ROOF_M, _ROOF_M + 0.2))
     for side in (-1.0, 1.0):
-        scenery.box((middle, side * (_STAIR_HALF_M + 0.1)), (length + 0.4, 0.2), (0.0, _ROOF_M))
-        scenery.box((middle + side * (0.5 * length + 0.1), 0.0), (0.2, 2.0 * _STAIR_HALF_M), (0.0, _ROOF_M))
-    for flight in range(_FLIGHTS):
+        scenery.box((middle, side * (_STAIRS.half_m + 0.1)), (length + 0.4, 0.2), (0.0, _ROOF_M))
+        scenery.box((middle + side * (0.5 * length + 0.1), 0.0), (0.2, 2.0 * _STAIRS.half_m), (0.0, _ROOF_M))
+    for flight in range(_STAIRS.flights):
         _flight(scenery, flight)
         far, outwards = (_RUN_M, 1.0) if flight % 2 == 0 else (0.0, -1.0)
-        level, center = (flight + 1) * _FLIGHT_M, (far + outwards * 0.5 * _LANDING_M, 0.0)
-        scenery.box(center, (_LANDING_M, 2.0 * _STAIR_HALF_M), (level - 0.2, level))
-        _furnish_landing(scenery, level, far + outwards * _LANDING_M, outwards, rng)
-    _furnish_landing(scenery, 0.0, -_LANDING_M, -1.0, rng)
-    for y in (-_STAIR_HALF_M + 0.1, _STAIR_HALF_M - 0.1):
-        scenery.cylinder((-_LANDING_M + 0.1, y), rng.uniform(0.03, 0.08), (0.0, _ROOF_M))
+        level, center = (flight + 1) * _FLIGHT_M, (far + outwards * 0.5 * _STAIRS.landing_m, 0.0)
+        scenery.box(center, (_STAIRS.landing_m, 2.0 * _STAIRS.half_m), (level - 0.2, level))
+        _furnish_landing(scenery, level, far + outwards * _STAIRS.landing_m, outwards, rng)
+    _furnish_landing(scenery, 0.0, -_STAIRS.landing_m, -1.0, rng)
+    for y in (-_STAIRS.half_m + 0.1, _STAIRS.half_m - 0.1):
+        scenery.cylinder((-_STAIRS.landing_m + 0.1, y), rng.uniform(0.03, 0.08), (0.0, _ROOF_M))
     return scenery.finish()
 
 
 def _flight(scenery: Scenery, flight: int) -> None:
     """Steps as slabs one above the other, a railing along the well in the middle."""
     side = -1.0 if flight % 2 == 0 else 1.0
-    low, width = flight * _FLIGHT_M, _STAIR_HALF_M - 0.1
-    for step in range(_STEPS_A_FLIGHT):
-        along = (step + 0.5) * _TREAD_M
-        x, top = (along if side < 0.0 else _RUN_M - along), low + (step + 1) * _RISE_M
-        scenery.box((x, side * (0.1 + 0.5 * width)), (_TREAD_M, width), (top - _RISE_M - 0.12, top))
+    low, width = flight * _FLIGHT_M, _STAIRS.half_m - 0.1
+    for step in range(_STAIRS.steps):
+        along = (step + 0.5) * _STAIRS.tread_m
+        x, top = (along if side < 0.0 else _RUN_M - along), low + (step + 1) * _STAIRS.rise_m
+        scenery.box((x, side * (0.1 + 0.5 * width)), (_STAIRS.tread_m, width), (top - _STAIRS.rise_m - 0.12, top))
         scenery.cylinder((x, side * 0.13), 0.015, (top, top + 0.85))
-        scenery.box((x, side * 0.13), (_TREAD_M, 0.05), (top + 0.85, top + 0.9))
+        scenery.box((x, side * 0.13), (_STAIRS.tread_m, 0.05), (top + 0.85, top + 0.9))
 
 
 def _furnish_landing(
@@ -426,5 +446,5 @@ def _furnish_landing(
         scenery.box((wall - outwards * 0.06, y), (0.12, rng.uniform(0.6, 1.2)), (level + 0.12, level + 0.7))
         scenery.box((wall - outwards * 0.1, y), (0.2, 1.4), (level + 0.95, level + 1.0))
     if rng.random() < 0.6:
-        corner = (wall - outwards * 0.12, float(rng.choice([-1.0, 1.0])) * (_STAIR_HALF_M - 0.3))
+        corner = (wall - outwards * 0.12, float(rng.choice([-1.0, 1.0])) * (_STAIRS.half_m - 0.3))
         scenery.cylinder(corner, 0.09, (level + 0.5, level + 1.0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,9 +52,17 @@ def tree(scenery: Scenery, x: float, y: float, rng: np.random.Generator) -> None
 
 # the town
 
-_STREETS_X_M = (-50.0, 0.0, 50.0, 100.0, 150.0)  # middles of the streets that run north
-_STREETS_Y_M = (-40.0, 0.0, 40.0, 80.0)  # and east
-_PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 3.1, 4.7, 5.2, 7.0  # from the middle of the street
+
+class CrossSection(NamedTuple):
+    """Distances of parked cars, lamps, trees and fronts of houses from the middle of a street."""
+
+    parked_m: float
+    lamp_m: float
+    tree_m: float
+    front_m: float
+
+
+_STREET = CrossSection(3.1, 4.7, 5.2, 7.0)
 
 TOWN_CAR = Vehicle(
     speed_m_s=9.0, acceleration_m_s2=2.5, lateral_acceleration_m_s2=4.0, corner_m=7.0, deviation_m=0.4,
@@ -83,8 +92,8 @@ def town(
     rng: np.random.Generator,
     parked: float = 0.55,
     *,
-    streets_x_m: Sequence[float] = _STREETS_X_M,
-    streets_y_m: Sequence[float] = _STREETS_Y_M,
+    streets_x_m: Sequence[float] = (-50.0, 0.0, 50.0, 100.0, 150.0),
+    streets_y_m: Sequence[float] = (-40.0, 0.0, 40.0, 80.0),
 ) -> Solids:
     """The town; streets and blocks are fixed, everything else is sampled from ``rng``.
 
@@ -106,17 +115,17 @@ def _block(
     scenery: Scenery, west: float, east: float, south: float, north: float, rng: np.random.Generator
 ) -> None:
     """Two rows of houses back to back, garden walls and hedges at the open ends, trees in the yard."""
-    for front, facing in ((south + _FRONT_M, 1.0), (north - _FRONT_M, -1.0)):
-        place = west + _FRONT_M + rng.uniform(0.0, 1.5)
-        while place < east - _FRONT_M - 7.0:
-            width = min(rng.uniform(8.0, 13.0), east - _FRONT_M - place)
+    for front, facing in ((south + _STREET.front_m, 1.0), (north - _STREET.front_m, -1.0)):
+        place = west + _STREET.front_m + rng.uniform(0.0, 1.5)
+        while place < east - _STREET.front_m - 7.0:
+            width = min(rng.uniform(8.0, 13.0), east - _STREET.front_m - place)
             _house(scenery, place + 0.5 * width, front + facing * rng.uniform(0.0, 2.0), width, facing, rng)
             gap = rng.uniform(1.5, 5.0)
             if rng.random() < 0.6:
                 hedge = (place + width + 0.5 * gap, front + facing * 0.3)
                 scenery.box(hedge, (gap, rng.uniform(0.2, 0.6)), (BELOW_M, rng.uniform(0.8, 1.8)))
             place += width + gap
-    for x in (west + _FRONT_M - 0.5, east - _FRONT_M + 0.5):
+    for x in (west + _STREET.front_m - 0.5, east - _STREET.front_m + 0.5):
         half = rng.uniform(2.0, 4.0)
         scenery.box((x, 0.5 * (south + north)), (0.25, 2.0 * half), (BELOW_M, rng.uniform(0.7, 1.6)))
     for _ in range(4):
@@ -166,15 +175,15 @@ def _street(
         place = 12.0 + rng.uniform(0.0, 3.0)
         while place < length - 12.0:
             if rng.random() < parked:
-                x, y = start + place * along + side * (_PARKED_M + rng.normal(0.0, 0.08)) * aside
+                x, y = start + place * along + side * (_STREET.parked_m + rng.normal(0.0, 0.08)) * aside
                 parked_car(scenery, float(x), float(y), yaw + rng.normal(0.0, 0.02), rng)
             place += rng.uniform(5.2, 7.5)
         for place in np.arange(9.0 + rng.uniform(0.0, 4.0), length - 9.0, rng.uniform(9.0, 14.0)):
-            x, y = start + place * along + side * _TREE_M * aside
+            x, y = start + place * along + side * _STREET.tree_m * aside
             if rng.random() < 0.6:
                 tree(scenery, float(x), float(y), rng)
         for place, radius, height in ((8.0, 0.09, 6.5), (length - 7.5, 0.03, 2.4), (0.55 * length, 0.09, 6.5)):
-            x, y = start + place * along + side * _LAMP_M * aside
+            x, y = start + place * along + side * _STREET.lamp_m * aside
             scenery.cylinder((float(x), float(y)), radius, (BELOW_M, height + rng.uniform(-0.3, 0.3)))
         x, y = start + rng.uniform(10.0, length - 10.0) * along + side * 6.2 * aside
         with scenery.movable():
@@ -194,9 +203,24 @@ def rounds(rng: np.random.Generator) -> Solids:
 
 # the highway
 
-_STRAIGHT_M, _BEND_M = 1000.0, 300.0
-_MEDIAN_M, _EDGE_M, _FAR_EDGE_M = 6.5, -4.5, 17.5  # rails, to the left of the lane driven in
-_PANEL_M = 4.0  # of a rail, between two posts
+
+class Highway(NamedTuple):
+    """A highway of two straights and two half circles.
+
+    straight_m, bend_m : length of a straight, radius of a bend
+    median_m, edge_m, far_edge_m : of the rails, to the left of the lane driven in
+    panel_m : length of a rail between two posts
+    """
+
+    straight_m: float = 1000.0
+    bend_m: float = 300.0
+    median_m: float = 6.5
+    edge_m: float = -4.5
+    far_edge_m: float = 17.5
+    panel_m: float = 4.0
+
+
+_HIGHWAY = Highway()
 
 HIGHWAY_CAR = Vehicle(
     speed_m_s=25.0, acceleration_m_s2=3.0, lateral_acceleration_m_s2=3.0, corner_m=15.0, deviation_m=0.3,
@@ -206,8 +230,8 @@ HIGHWAY_CAR = Vehicle(
 
 # Two straights and two half circles, a point every 2° of a bend; the first bend begins after 350 m.
 _TURN = np.deg2rad(np.arange(-90.0, 91.0, 2.0))
-_ARC = _BEND_M * np.column_stack([np.cos(_TURN), 1.0 + np.sin(_TURN)])
-_BEGIN, _END = np.array([350.0, 0.0]), np.array([350.0 - _STRAIGHT_M, 2.0 * _BEND_M])
+_ARC = _HIGHWAY.bend_m * np.column_stack([np.cos(_TURN), 1.0 + np.sin(_TURN)])
+_BEGIN, _END = np.array([350.0, 0.0]), np.array([350.0 - _HIGHWAY.straight_m, 2.0 * _HIGHWAY.bend_m])
 HIGHWAY_ROUTE = np.vstack([np.zeros((1, 2)), _BEGIN + _ARC, _END - _ARC])
 
 
@@ -216,8 +240,8 @@ def highway(rng: np.random.Generator) -> Solids:
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
     scenery = Scenery(np.array([0.0, 0.8, 2.0 * np.pi / 420.0, phase_x, 0.8, 2.0 * np.pi / 330.0, phase_y]))
     road = Lap(HIGHWAY_ROUTE)
-    _rail(scenery, road, _MEDIAN_M, 0.0, road.length_m)
-    for left in (_EDGE_M, _FAR_EDGE_M):
+    _rail(scenery, road, _HIGHWAY.median_m, 0.0, road.length_m)
+    for left in (_HIGHWAY.edge_m, _HIGHWAY.far_edge_m):
         begin = 0.0
         while begin < road.length_m:
             end = begin + rng.uniform(150.0, 400.0)
@@ -229,9 +253,9 @@ def highway(rng: np.random.Generator) -> Solids:
 
 
 def _rail(scenery: Scenery, road: Lap, left_m: float, begin_m: float, end_m: float) -> None:
-    for along in np.arange(begin_m, end_m - _PANEL_M, _PANEL_M):
-        middle = along + 0.5 * _PANEL_M
-        size = (_PANEL_M * (1.0 + abs(left_m) / _BEND_M), 0.08)  # no gaps on the outside of a bend
+    for along in np.arange(begin_m, end_m - _HIGHWAY.panel_m, _HIGHWAY.panel_m):
+        middle = along + 0.5 * _HIGHWAY.panel_m
+        size = (_HIGHWAY.panel_m * (1.0 + abs(left_m) / _HIGHWAY.bend_m), 0.08)  # no gaps on the outside of a bend
         scenery.box(road.beside(middle, left_m), size, (0.45, 0.76), road.yaw_rad(middle))
         scenery.cylinder(road.beside(along, left_m), 0.06, (BELOW_M, 0.7))
 
@@ -272,22 +296,18 @@ def _landscape(scenery: Scenery, road: Lap, rng: np.random.Generator) -> None:
 
 # the field
 
-FIELD_SIGHT_M = 60.0  # range limit by haze
-_FIELD_LONG_M, _FIELD_SHORT_M = 440.0, 160.0
-_POLES = ((30.0, 0.0), (260.0, 0.0), (425.0, 0.0), (300.0, _FIELD_SHORT_M), (70.0, _FIELD_SHORT_M))
-
 TRACTOR = Vehicle(
     speed_m_s=10.0, acceleration_m_s2=2.0, lateral_acceleration_m_s2=3.0, corner_m=12.0, deviation_m=0.4,
     sway_rad=0.008, heave_m=0.02, radius_m=1.2, T_base_lidar=mount(0.8, 1.9),
 )  # fmt: skip
 
-FIELD_ROUTE = np.array([[0.0, 0.0], [_FIELD_LONG_M, 0.0], [_FIELD_LONG_M, _FIELD_SHORT_M], [0.0, _FIELD_SHORT_M]])
+FIELD_ROUTE = np.array([[0.0, 0.0], [440.0, 0.0], [440.0, 160.0], [0.0, 160.0]])
 
 
 def field(rng: np.random.Generator) -> Solids:
     """Groups of three poles along the route, about 230 m apart, and the ground."""
     scenery = Scenery()
-    for x, y in _POLES:
+    for x, y in ((30.0, 0.0), (260.0, 0.0), (425.0, 0.0), (300.0, 160.0), (70.0, 160.0)):
         for along, side in ((-7.0, 1.0), (0.0, -1.0), (7.0, 1.0)):
             place = (x + along + rng.uniform(-2.0, 2.0), y + side * rng.uniform(6.0, 11.0))
             scenery.cylinder(place, rng.uniform(0.12, 0.22), (0.0, rng.uniform(4.0, 7.0)))
@@ -298,7 +318,6 @@ def field(rng: np.random.Generator) -> Solids:
 
 _SPACING_M, _BEYOND_M = 4.6, 45.0  # between trunks; how far the forest extends beyond the route
 _PATH_FREE_M = 1.6  # kept free on either side of the route
-_WAVES = 4
 
 MULE = Vehicle(
     speed_m_s=2.5, acceleration_m_s2=1.0, lateral_acceleration_m_s2=1.2, corner_m=2.5, deviation_m=0.25,
@@ -330,13 +349,14 @@ def forest(rng: np.random.Generator) -> Solids:
 
 
 def _hills(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Hills of 0.8 m with superimposed waves 4 to 12 m long, at most 9 cm high each."""
+    """Hills of 0.8 m with four superimposed waves 4 to 12 m long, at most 9 cm high each."""
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
     hills = [0.0, 0.8, 2.0 * np.pi / 60.0, phase_x, 0.6, 2.0 * np.pi / 45.0, phase_y]
-    length_m = np.geomspace(4.0, 12.0, _WAVES)
-    heading = np.pi * (np.arange(_WAVES) * 0.382 + rng.uniform(0.0, 1.0, _WAVES) / _WAVES)
+    length_m = np.geomspace(4.0, 12.0, 4)
+    count = len(length_m)
+    heading = np.pi * (np.arange(count) * 0.382 + rng.uniform(0.0, 1.0, count) / count)
     wave = 2.0 * np.pi / length_m
-    phase = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
+    phase = rng.uniform(0.0, 2.0 * np.pi, count)
     rows = np.column_stack([0.0075 * length_m, wave * np.cos(heading), wave * np.sin(heading), phase])
     return np.concatenate([hills, rows.ravel()])
 
@@ -368,7 +388,7 @@ def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng:
 
 # the yard
 
-_YARD_X_M, _YARD_Y_M = 19.0, 15.0
+_YARD_X_M, _YARD_Y_M = 19.0, 15.0  # half the length and half the width between its walls
 
 YARD_ROBOT = Vehicle(
     speed_m_s=1.5, acceleration_m_s2=1.5, lateral_acceleration_m_s2=1.0, sway_rad=0.006, heave_m=0.004,
