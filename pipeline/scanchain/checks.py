@@ -16,16 +16,15 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from scanchain.config_keys import LARGEST
 from scanchain.errors import InputError, one_line, shown
 from scanchain.kernels.geometry import largest_magnitude, rigidity_error
 from scanchain.kernels.voxels import REACH
 
-_RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
+RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _LARGEST_VOXEL = float(1 << 31)  # the index of a voxel along an axis has 32 bits
-_MOST_WHOLE = 1 << 63  # smallest whole number that does not fit into 64 bits
 _LATEST_S = 1e11  # latest stamp, seconds: the year 5138
 SMALLER_UNITS = " (from milliseconds: 1e-3 * stamp, microseconds: 1e-6, nanoseconds: 1e-9)"
-LARGEST = 1e50  # largest number in points, weights or a graph: products of a few are still finite
 LONGEST_SWEEP_S = 10.0  # largest time between the stamp of a scan and any of its points
 
 
@@ -84,7 +83,7 @@ def pose(value: object, name: str, d: int) -> NDArray[np.float64]:
     wanted = f"a ({n}, {n}) pose, because the points are {d}D"
     array = _shaped(_numbers(value, name, f"a ({n}, {n}) pose"), name, (n, n), wanted)
     error = rigidity_error(array)
-    if not error <= _RIGID:
+    if not error <= RIGID:
         off = f"is not a rigid transformation (off by {error:.2g})"
         what = "holds NaN or infinite values" if math.isinf(error) else off
         raise InputError(f"{name} {what}; wanted [R t; 0 1] with RᵀR = I and det R = 1")
@@ -96,7 +95,7 @@ def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
     wanted = f"(N, {d + 1}, {d + 1})"
     array = _shaped(_numbers(value, name, f"an {wanted} array of poses"), name, (None, d + 1, d + 1), wanted)
     for index, each in enumerate(array):
-        if not rigidity_error(each) <= _RIGID:
+        if not rigidity_error(each) <= RIGID:
             pose(each, f"{name}[{index}]", d)
     return array
 
@@ -179,7 +178,7 @@ def integer(value: object, name: str, wanted: str, *, least: int | None = None) 
         whole = None
     if whole is None or isinstance(value, bool) or (least is not None and whole < least):
         raise InputError(f"{name} is {shown(value)}; wanted {wanted}")
-    if abs(whole) >= _MOST_WHOLE:
+    if abs(whole) > np.iinfo(np.int64).max:
         raise InputError(f"{name} is {shown(value)}, too large for 64 bits; wanted {wanted}")
     return whole
 

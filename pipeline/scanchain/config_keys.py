@@ -23,7 +23,7 @@ _UNITS = {  # by the ending of a name; the first that fits
 }  # fmt: skip
 _TRUTHS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 _OWN = "MODULE:CLASS"  # a user's own
-LARGEST = 1e50  # beyond which products of a few numbers are infinite
+LARGEST = 1e50  # largest number in settings, points or a graph: products of a few are still finite
 
 
 @dataclass(frozen=True, slots=True)

@@ -408,6 +408,7 @@ class Closure:
         return replace(self, verdict=ClosureVerdict.REJECTED, cause=problem.cause, reason=problem.text)
 
 
+DOWNWEIGHTED = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 REJECTED_WEIGHT = 1e-6  # robust weight below which an edge is not in force
 
 

@@ -11,13 +11,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from scanchain.errors import InputError, ScanchainError
+from scanchain.files import ATTEMPTS, BLOCK_BYTES, SILENCE_S
+from scanchain.processes import MIB
 
 Progress = Callable[[int, int], None]
 
-_BLOCK_BYTES = 1 << 18
-_MIB = 1 << 20
-_TIMEOUT_S = 30.0
-_ATTEMPTS = 4
 _BROKEN = (http.client.HTTPException, ConnectionError, TimeoutError, urllib.error.URLError)
 
 
@@ -50,7 +48,7 @@ def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress |
 def _complete(url: str, part: Path, progress: Progress | None) -> None:
     """Download the missing bytes, with a new request after each interruption."""
     reason = ""
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
         try:
             if _more(url, part, progress):
                 return
@@ -70,14 +68,14 @@ def _more(url: str, part: Path, progress: Progress | None) -> bool:
     """One request from the first missing byte on; True if the file is complete."""
     have = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
-    with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as response:
+    with urllib.request.urlopen(request, timeout=SILENCE_S) as response:
         is_rest = response.status == http.client.PARTIAL_CONTENT
         have = have if is_rest else 0
         total = have + int(response.headers.get("Content-Length", -have))
         with part.open("ab" if is_rest else "wb") as file:
-            while block := response.read(_BLOCK_BYTES):
+            while block := response.read(BLOCK_BYTES):
                 file.write(block)
                 have += len(block)
                 if progress is not None:
-                    progress(have // _MIB, total // _MIB)
+                    progress(have // MIB, total // MIB)
     return not total or have == total

@@ -90,7 +90,7 @@ def remedy_of(error: OSError) -> str:
     return f"{error.filename}: {remedy}" if error.filename and remedy else remedy
 
 
-_SHOWN = 3  # number of lines shown of those that differ only in numbers
+FIRST = 3  # number of lines shown of several of a kind
 _LABEL = re.compile(r" *(\S+( \S+)* {2,}){1,2}| +")  # names before the text of a line
 FREEDOM = ("degree of freedom", "degrees of freedom")
 
@@ -137,7 +137,7 @@ def grouped(lines: Iterable[str]) -> list[str]:
         kinds.setdefault(re.sub(r"\d+", "#", line), []).append(line)
     result: list[str] = []
     for alike in kinds.values():
-        result += alike[:_SHOWN]
-        if len(alike) > _SHOWN:
-            result[-1] += f" (and {len(alike) - _SHOWN:,} more like this)"
+        result += alike[:FIRST]
+        if len(alike) > FIRST:
+            result[-1] += f" (and {len(alike) - FIRST:,} more like this)"
     return result

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
+BLOCK_BYTES = 1 << 20  # read or written at once where the whole may not fit the memory
+ATTEMPTS = 4  # number of requests before an error of the network that may be transient is final
+SILENCE_S = 30.0  # longest time without data from the network
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
 

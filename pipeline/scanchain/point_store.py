@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from scanchain.data import RaySpan
 from scanchain.errors import InputError
+from scanchain.files import BLOCK_BYTES
 
 _NUMBER = np.dtype("<f4")  # as lidars give them
-_MOST_WAITING = 1 << 18  # size of the write buffer, bytes
 
 
 class PointStore:
@@ -43,7 +43,7 @@ class PointStore:
         stored = StoredPoints(self, self.rows, len(points), spans)
         self.waiting += points.astype(_NUMBER).tobytes()
         self.rows += len(points)
-        if len(self.waiting) >= _MOST_WAITING:
+        if len(self.waiting) >= BLOCK_BYTES:
             self.flush()
         return stored
 
@@ -76,7 +76,7 @@ class PointStore:
         if path.is_file() and path.stat().st_size >= size:
             os.truncate(path, size)
             with path.open("rb") as file:
-                while part := file.read(_MOST_WAITING):
+                while part := file.read(BLOCK_BYTES):
                     crc = zlib.crc32(part, crc)
         if not path.is_file() or path.stat().st_size != size or crc != self.crc:
             raise InputError(f"{path}: is missing, too short or damaged; run without --resume")

@@ -20,9 +20,13 @@ from time import monotonic
 
 import psutil
 
-_MIB = 1024.0**2
-_SYSTEM_KILL = -9  # code of a process that the system killed, as it does when memory runs out
-_LAST_CHARACTERS = 300  # of the output of a process that crashed, which are reported
+MIB = 1 << 20  # bytes
+MIB_PER_GIB = 1024.0  # as options and messages give memory in GiB
+MOST_CHARACTERS = 300  # largest length of a message of other code, or of the output of a crash, in a report
+MEMORY_SHARE = 0.75  # share of the free memory that processes take by default: the rest is for the system
+LOOK_S = 0.05  # time between two looks at a process, for its memory, or a thread that is waited for
+_READ_S, _READ_S_PER_MIB = 60.0, 1.0  # longest time to read a file of other software; a MiB takes about 0.05 s
+_READ_MIB, _READ_TIMES = 1024.0, 100.0  # largest memory to read it, and times its size
 
 
 def peak_mib() -> float:
@@ -34,7 +38,7 @@ def peak_mib() -> float:
                 return int(line.split()[1]) / 1024.0
     import resource  # of POSIX only
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MIB  # bytes on macOS
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB  # bytes on macOS
 
 
 def resident_mib(pid: int, seen: dict[int, psutil.Process] | None = None) -> float:
@@ -44,7 +48,7 @@ def resident_mib(pid: int, seen: dict[int, psutil.Process] | None = None) -> flo
         with suppress(psutil.Error):
             seen[each] = seen.get(each) or psutil.Process(each)
             total += seen[each].memory_info().rss
-    return total / _MIB
+    return total / MIB
 
 
 def _family(pid: int) -> list[int]:
@@ -69,7 +73,7 @@ def return_freed_memory() -> None:
 
 def available_mib() -> float:
     """Memory that is available without swapping."""
-    return psutil.virtual_memory().available / _MIB
+    return psutil.virtual_memory().available / MIB
 
 
 def die_first() -> None:
@@ -84,6 +88,13 @@ class Limits:
 
     time_s: float
     memory_mib: float
+
+
+def reading_limits(file: Path) -> Limits:
+    """Limits of a process that reads a file of other software, which may be damaged."""
+    size_mib = file.stat().st_size / MIB
+    memory_mib = min(_READ_MIB + _READ_TIMES * size_mib, available_mib())
+    return Limits(_READ_S + _READ_S_PER_MIB * size_mib, memory_mib)
 
 
 class KilledFor(Enum):
@@ -111,7 +122,9 @@ class Ending:
     @property
     def how(self) -> str:
         """End state of a process that did not end by itself: out of memory, timed out, not run or crashed."""
-        by_system = self.killed_for is KilledFor.NOTHING and self.code == _SYSTEM_KILL
+        by_system = (
+            self.killed_for is KilledFor.NOTHING and self.code == -signal.SIGKILL
+        )  # as the system does when memory runs out
         return KilledFor.MEMORY.value if by_system else self.killed_for.value
 
     def reason(self, limits: Limits, output: str) -> str:
@@ -119,13 +132,13 @@ class Ending:
         if self.killed_for is KilledFor.TIME:
             return f"took longer than --time-limit ({limits.time_s:.3g} s)"
         if self.killed_for is KilledFor.MEMORY:
-            return f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)"
+            return f"took more than --memory-limit ({limits.memory_mib / MIB_PER_GIB:.3g} GiB)"
         if self.how == KilledFor.MEMORY.value:
             return "killed, as the system does when memory runs out"
         how = f"exit code {self.code}"
         if self.code < 0:  # most real-time signals have no name
             how = next((each.name for each in signal.Signals if each == -self.code), f"signal {-self.code}")
-        last = " ".join(output.split())[-_LAST_CHARACTERS:]
+        last = " ".join(output.split())[-MOST_CHARACTERS:]
         return f"ended by {how}" + (f": {last}" if last else "")
 
 
@@ -153,14 +166,12 @@ def run_within(
     environment: Mapping[str, str],
     *,
     output: Path,
-    interval_s: float,
     stop: Event | None = None,
 ) -> Ending:
     """Run a module of Python to its end, or kill it when it exceeds a limit or ``stop`` is set.
 
     It has a process group of its own, which ends with it: a Ctrl-C on the terminal does not reach it. The module
     calls ``die_with_parent``, or is run by this one, ``python -m scanchain.processes MODULE``, which does.
-    interval_s : seconds between two readings of its memory
     """
     with output.open("wb") as out:
         process = subprocess.Popen(
@@ -180,7 +191,7 @@ def run_within(
                     reason = KilledFor.MEMORY
                 elif monotonic() - began > limits.time_s:
                     reason = KilledFor.TIME
-                elif stop.wait(interval_s):
+                elif stop.wait(LOOK_S):
                     reason = KilledFor.STOP
             return Ending(process.returncode or 0, reason, peak, monotonic() - began)
         finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 VARIABLE = "SCANCHAIN_THREADS"
-MOST = 256
+MOST = 256  # largest number of threads that is accepted
 
 
 def use_threads(count: int) -> None:

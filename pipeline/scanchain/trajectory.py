@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import checks, lie
+from scanchain.checks import RIGID
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError, counted, remedy_of
 
-_NS_PER_S = 1_000_000_000
+_NS_PER_S = 1_000_000_000  # nanoseconds, as whole numbers: stamps are exact
 _TUM_ROW, _KITTI_ROW = 7 * " %.9f", " ".join(12 * ["%.9e"]) + "\n"
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
-_OUT_OF_PLANE = 1e-12  # m² or rad², variance of z, roll and pitch of poses in the plane
+LEAST_VARIANCE = 1e-12  # m² or rad², of z, roll and pitch in the plane, and of what else would be singular
 _UNIT = 0.01  # largest deviation from 1 of the length of a quaternion, which may be written with two digits
-_ORTHONORMAL = 1e-3  # largest deviation of RᵀR from identity in a KITTI file, which is written with few digits
 
 
 def read_tum(path: Path | str) -> Trajectory:
@@ -65,7 +65,7 @@ def write_wide_tum(path: Path, trajectory: Trajectory, covariances: Matrix) -> N
     """
     lifted = covariances
     if trajectory.dimension == 2:
-        lifted = np.tile(_OUT_OF_PLANE * np.eye(6), (len(trajectory), 1, 1))
+        lifted = np.tile(LEAST_VARIANCE * np.eye(6), (len(trajectory), 1, 1))
         lifted[:, *np.ix_((0, 1, 5), (0, 1, 5))] = covariances
     lower = np.tril_indices(6)
     with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
@@ -81,8 +81,8 @@ def read_kitti(path: Path | str) -> Trajectory:
     places, _, values = table(path, "KITTI line", _KITTI_FIELDS)
     rows = values.reshape(-1, 3, 4)
     error = np.abs(np.swapaxes(rows[:, :, :3], 1, 2) @ rows[:, :, :3] - np.eye(3)).max(axis=(1, 2))
-    for bad in np.flatnonzero((error > _ORTHONORMAL) | (np.linalg.det(rows[:, :, :3]) < 0.0))[:1]:
-        raise InputError(f"{places[bad]} is not a rotation: RᵀR is not the identity within {_ORTHONORMAL:g}")
+    for bad in np.flatnonzero((error > RIGID) | (np.linalg.det(rows[:, :, :3]) < 0.0))[:1]:
+        raise InputError(f"{places[bad]} is not a rotation: RᵀR is not the identity within {RIGID:g}")
     U, _, Vt = np.linalg.svd(rows[:, :, :3])
     return Trajectory(np.arange(len(rows), dtype=np.int64), posed(U @ Vt, rows[:, :, 3]))
 

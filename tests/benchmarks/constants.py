@@ -1,13 +1,13 @@
 """Constants of the product: how many there are, and which change nothing at half and at double their value.
 
-    python -m tests.benchmarks.constants [--room ROOM ...] [--count] [--workers N]
+    python -m tests.benchmarks.constants [--room ROOM ...] [--cases N] [--workers N] [--count]
 
 A constant is a name in module scope bound to a number, or to a tuple or dictionary of numbers. Each is set to half
 and to double its value in every module that holds it, and those of the cases below that call a function which
 reads it run again, the quick ones first, until the result of one differs in a bit. The table says which,
 "nothing" where all are the same, and "not reached" where no case calls such a function. ROOM limits this to
-constants of files whose path contains it. Constants of kernels are compiled in, and others are read while modules
-are imported: both are only counted.
+constants of files whose path contains it, N to the quickest cases that reach each. Constants of kernels are
+compiled in, and others are read while modules are imported: both are only counted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache
+from functools import cache, partial
 from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
@@ -185,15 +185,15 @@ def usual(name: str) -> tuple[str, frozenset[tuple[str, str]], float]:
     return digest(CASES[name]), called, time.perf_counter() - started
 
 
-def tried(constant: Constant) -> str:
-    """What the first case says whose result differs with another value."""
+def tried(constant: Constant, most: int) -> str:
+    """The first case whose result differs with another value, and that value."""
     cases = sorted((name for name in CASES if readers(constant, usual(name)[1])), key=lambda name: usual(name)[2])
-    for name in cases:
+    for name in cases[:most]:
         for factor in FACTORS:
             with Changed(constant, factor):
                 if digest(CASES[name]) != usual(name)[0]:
                     return f"{name} at {factor:g}"
-    return f"nothing ({', '.join(cases)})" if cases else "not reached"
+    return f"nothing ({', '.join(cases[:most])})" if cases else "not reached"
 
 
 def slam_of(scans: Iterable[Scan], dimension: int, mounting: Matrix | None = None, **options: object) -> bytes:
@@ -269,7 +269,8 @@ def of_drive(folder: Path) -> bytes:
     """A simulated drive with error bars, evaluated."""
     log = drive_of("town", "vlp-16", 60, CACHE)
     done = scanchain.run(log, folder / "run", recording=False)
-    return of_directory(done.path) + repr(scanchain.evaluate(done.path, log.with_suffix(".tum"))).encode()
+    figures = done.metrics.expected_ate_m, scanchain.evaluate(done.path, log.with_suffix(".tum"))
+    return of_directory(done.path) + repr(figures).encode()
 
 
 def of_doctor(folder: Path) -> bytes:
@@ -331,7 +332,7 @@ CASES: dict[str, Case] = {
 
 
 def main() -> None:
-    arguments = options_of(__doc__, cache=False, room=[""], count=False, workers=1)
+    arguments = options_of(__doc__, cache=False, room=[""], count=False, cases=len(CASES), workers=1)
     names = Counter(each.name for each in constants())
     kernels = sum("/kernels/" in str(each.path) for each in constants())
     shared = sum(count > 1 for count in names.values())
@@ -345,7 +346,9 @@ def main() -> None:
         if "/kernels/" not in str(each.path) and any(room in str(each.path) for room in arguments.room)
     ]
     with ProcessPoolExecutor(arguments.workers, get_context("spawn")) as executor:
-        for constant, found in zip(chosen, executor.map(tried, chosen), strict=True):
+        for constant, found in zip(
+            chosen, executor.map(partial(tried, most=arguments.cases), chosen), strict=True
+        ):
             row(f"`{constant.module}.{constant.name}`", constant.value, found)
 
 

@@ -151,7 +151,7 @@ def _print_peak(*words: str) -> None:
     """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict."""
     with tempfile.TemporaryDirectory() as folder:
         unlimited, said = Limits(np.inf, np.inf), Path(folder) / "said"
-        ended = run_within(unlimited, "scanchain", words, os.environ, output=said, interval_s=0.05)
+        ended = run_within(unlimited, "scanchain", words, os.environ, output=said)
     assert ended.code in (0, 1), ended
     print(f"{words[0]}: {ended.peak_mib:.0f} MiB at most", flush=True)
 

@@ -12,7 +12,7 @@ SUPPORT = ROOT / "tests" / "support"  # where the class of a method such as bad_
 def here(patch):
     """Let comparisons start no processes as long as a patch lasts."""
 
-    def run_here(limits, module, arguments, environment, *, output, interval_s, stop=None):
+    def run_here(limits, module, arguments, environment, *, output, stop=None):
         worker.run(Path(arguments[0]))
         return Ending(0, KilledFor.NOTHING, 0.0, 0.0)
 

@@ -21,7 +21,7 @@ from scanchain.errors import InputError, MissingExtraError, counted, duration, s
 from scanchain.files import Source, source_of, write_whole
 from scanchain.logs.files import matching, misspelled
 from scanchain.logs.opening import AUTO, logs_in
-from scanchain.processes import Limits, available_mib
+from scanchain.processes import MEMORY_SHARE, Limits, available_mib
 from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.job import Progress
 from scanchain.runs.metrics import Metrics
@@ -30,7 +30,6 @@ from scanchain.settings import Override
 from scanchain.verdict import Verdict
 
 _NODE_LOSSES = 10  # largest number of retries of a task after its cluster node died
-_SHARE = 0.75  # share of the free memory for all workers together
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
     "scans", "dimension", "ok", "contradicted", "degenerate", "lost", "keyframes", "closures_tried",
@@ -138,7 +137,7 @@ def _check_out(batch: Batch) -> None:
 
 
 def _tasks(batch: Batch) -> list[Task]:
-    share_mib = _SHARE * available_mib() / batch.workers
+    share_mib = MEMORY_SHARE * available_mib() / batch.workers
     limits, tasks = Limits(batch.time_s, share_mib if batch.memory_mib is None else batch.memory_mib), []
     for log in batch.logs:
         path = str(log.absolute()) if isinstance(log, Path) else log.url

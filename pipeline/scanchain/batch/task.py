@@ -123,7 +123,6 @@ def key_of(identity: str, config_file: Path | None, overrides: Sequence[Override
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-_LOOK_S = 0.1
 _THREADS = (VARIABLE, *(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL", "RAYON")))
 
 
@@ -144,7 +143,6 @@ def _tried(task: Task, stop: Event | None) -> Row:
         ["scanchain", "run", "--out", str(task.run), "--force", *task.arguments, "--", task.log],
         os.environ | dict.fromkeys(_THREADS, "1"),  # one process per core: more threads would only compete
         output=output,
-        interval_s=_LOOK_S,
         stop=stop,
     )
     text = output.read_text(encoding="utf-8", errors="replace")

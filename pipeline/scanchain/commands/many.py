@@ -15,7 +15,7 @@ from scanchain.errors import InputError, ScanchainError, counted, folded
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
 
-_DAY_S = 86_400.0
+_DAY_S = 86_400.0  # time limit of a log where none is given
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")

@@ -11,6 +11,7 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH, OverrideCommand
+from scanchain.data import DOWNWEIGHTED
 from scanchain.errors import FREEDOM, InputError, counted, folded
 from scanchain.settings import Override, load_settings
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 _POOR_FIT = 10.0  # χ² per degree of freedom above which a slightly wrong noise model is no explanation
-_HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
@@ -239,7 +239,7 @@ class _Report:
                 "information matrices are too large; --robust truncated finds wrong loop edges"
             )
         weight = graph.weight[graph.is_loop]
-        downweighted = int((weight < _HALF).sum())
+        downweighted = int((weight < DOWNWEIGHTED).sum())
         if 2 * downweighted > len(weight):
             notes.append(
                 f"{downweighted:,} of {len(weight):,} loop edges are rejected or have a weight below ½: if they "

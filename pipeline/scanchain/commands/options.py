@@ -15,12 +15,12 @@ import msgspec
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.files import source_of
+from scanchain.processes import MIB_PER_GIB
 from scanchain.settings import Override
 from scanchain.threads import MOST, use_threads
 
 _GARBAGE_EVERY = 500_000  # new objects between two garbage collections; frequent ones cost 5 % of the time
 _ALIASES = "scanchain.commands.aliases"
-_MIB_PER_GIB = 1024.0
 PATH = click.Path(path_type=Path)
 
 
@@ -217,7 +217,7 @@ def limits(what: str, *, time_default: str, memory_default: str) -> Callable[[An
             "--memory-limit",
             "memory_mib",
             type=ABOVE_ZERO,
-            callback=lambda _, __, gib: None if gib is None else _MIB_PER_GIB * gib,
+            callback=lambda _, __, gib: None if gib is None else MIB_PER_GIB * gib,
             metavar="GIB",
             help=f"Memory limit of {what}. [default: {memory_default}]",
         ),

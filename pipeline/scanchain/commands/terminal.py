@@ -19,7 +19,7 @@ from scanchain.runs.job import Progress
 if TYPE_CHECKING:
     from scanchain.data import Scan
 
-_REDRAW_S = 0.2
+_REDRAW_S = 0.2  # shortest time between two drawings of a bar
 _CLEAR = "\r\033[K"  # moves to the start of the line and clears it
 _WIDTH = 30  # characters of a full bar
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]

@@ -22,13 +22,12 @@ from scanchain.evaluation import absolute_error_of_any_path, pair, read_relation
 from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.odometry.distortion import choose_point_times
-from scanchain.processes import Limits, available_mib
+from scanchain.processes import MEMORY_SHARE, Limits, available_mib
 from scanchain.runs.directory import RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.settings import Override, load_settings, named
 
 _LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
-_SHARE = 0.75  # share of the free memory that is the default limit
 _SHARED = "scans"  # in the directory until it is complete: what all methods read, and where each writes
 
 
@@ -98,7 +97,7 @@ def compare(
         reference = _reference(log, scans, ground_truth, relations, named(of_log, "log.ground_truth_topic"))
         limits = Limits(
             _LEAST_S + _SCAN_S * len(scans) if time_s is None else time_s,
-            _SHARE * available_mib() if memory_mib is None else memory_mib,
+            MEMORY_SHARE * available_mib() if memory_mib is None else memory_mib,
         )
         outcomes = run_all(chosen, scans, shared, repeat=repeat, limits=limits, progress=progress)
         progress.announce("evaluating and drawing")

@@ -29,7 +29,6 @@ STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
 
 T = TypeVar("T")
 _SIZE_BYTES = 8  # of the size in front of a stored scan
-_INTERVAL_S = 0.02  # between two readings of a process's memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,9 +189,7 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
     # small_gicp's threads spin by default: on shared cores that delays other threads
     environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
     output, own = folder / "output.txt", folder / REPORT_FILE
-    ending = run_within(
-        limits, "scanchain.comparison.worker", [str(folder)], environment, output=output, interval_s=_INTERVAL_S
-    )
+    ending = run_within(limits, "scanchain.comparison.worker", [str(folder)], environment, output=output)
     if ending.killed_for is KilledFor.NOTHING and own.exists():
         report = msgspec.json.decode(own.read_bytes(), type=EndReport)
     else:

@@ -26,7 +26,7 @@ from scanchain.errors import InputError, at_most
 from scanchain.evaluation import ExpectedError
 from scanchain.logs import Log
 from scanchain.maps import write_ply
-from scanchain.processes import Limits
+from scanchain.processes import MIB_PER_GIB, Limits
 from scanchain.runs.evidence import evidence_of_trajectory
 from scanchain.runs.judging import judge_run, known_of_run
 from scanchain.runs.provenance import Provenance, package_version
@@ -38,7 +38,7 @@ from scanchain.verdict import Judged, Verdict, apart_m, judge
 SCANS_FILE, RELATIONS_FILE = "per_scan.parquet", "per_relation.parquet"
 SETTINGS_FILE, TRUTH_FILE = "settings.toml", "ground_truth.tum"
 METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tum"
-_PICTURE_POINTS = 150_000
+_PICTURE_POINTS = 150_000  # largest number of points of a method's map that is written
 _INTERVALS = ((1.0, "s"), (10.0, "m"), (100.0, "m"))  # of the RPE
 _NOTES = {
     "x y z qx qy qz qw": "final T_world_lidar of the method",
@@ -371,7 +371,7 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
         rows=rows,
         disagreement_m=[[value if np.isfinite(value) else None for value in row] for row in apart_m.tolist()],
         notes=[
-            f"a run is stopped at its limits: {limits.time_s:,.0f} s, {limits.memory_mib / 1024.0:.1f} GiB",
+            f"a run is stopped at its limits: {limits.time_s:,.0f} s, {limits.memory_mib / MIB_PER_GIB:.1f} GiB",
             *log.notes,
             *log.damage,
         ],

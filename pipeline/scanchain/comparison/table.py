@@ -72,7 +72,7 @@ class Column(Struct, frozen=True):
         ]
 
 
-_DEGREES = 57.29577951308232
+_DEGREES = math.degrees(1.0)
 
 COLUMNS = (
     Column("ate_m", "ATE", "m", 1.0, 4, "low", "summary",

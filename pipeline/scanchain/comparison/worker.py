@@ -26,13 +26,12 @@ from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import EndReport, Status, StoredScans
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import MissingExtraError, ScanchainError, one_line, shown
-from scanchain.processes import die_first, die_with_parent, peak_mib
+from scanchain.processes import MOST_CHARACTERS, die_first, die_with_parent, peak_mib
 
 if TYPE_CHECKING:
     from scanchain.comparison.ours import Ours
 
-_WARM_UP_SCANS = 4
-_MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
+_WARM_UP_SCANS = 4  # scans processed before the clock starts: they load the kernels
 
 
 def start(method: Method, T_base_lidar: Pose, *, is_mounted: bool = True) -> Ours | _Others:
@@ -134,7 +133,7 @@ def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 
 def _words(error: Exception) -> str:
-    return f"{type(error).__name__}: {one_line(error)[:_MAX_CHARACTERS]}"
+    return f"{type(error).__name__}: {one_line(error)[:MOST_CHARACTERS]}"
 
 
 if __name__ == "__main__":

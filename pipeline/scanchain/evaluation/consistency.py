@@ -30,10 +30,10 @@ _MOST_MEDIANS = 3.0  # influence of a group of directions over the median, above
 _MOST_OPEN = 0.5  # largest standard deviation of the instant of a pose in a distorted scan, over its duration
 _LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
 
-RADIUS_M = {2: 0.2, 3: 0.5}
+RADIUS_M = {2: 0.2, 3: 0.5}  # of the neighborhood whose thickness is measured, by dimension
 REACH_M = 40.0  # largest range of the points that are compared: those farther off are too sparse
-MIN_NEIGHBORS = 10
-MAX_POINTS, MAX_QUERIES = 600_000, 15_000
+MIN_NEIGHBORS = 10  # fewest points in a neighborhood whose thickness is measured
+MAX_POINTS, MAX_QUERIES = 600_000, 15_000  # of a map, and of them those whose neighborhoods are measured: seconds
 _AT_ONCE = 64  # number of queries whose neighbors are in memory at a time
 _MIN_COVERAGE = 0.5  # least share of the query points of the best map that another must cover to be compared
 

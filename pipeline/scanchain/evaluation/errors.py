@@ -21,9 +21,9 @@ from scanchain.trajectory import posed, table
 
 Floats = NDArray[np.float64]
 
-KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-SHORT_LENGTHS_M = (10.0, 20.0, 40.0)
-RELATION_LIMIT_S = 1e-3
+KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)  # of the benchmark
+SHORT_LENGTHS_M = (10.0, 20.0, 40.0)  # of segments of paths that are too short for these
+RELATION_LIMIT_S = 1e-3  # between a stamp of a relation and that of its pose; either may be in milliseconds
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 _FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # ATE above both of which odometry failed: share of the path, meters
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share

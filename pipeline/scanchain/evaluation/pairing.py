@@ -21,7 +21,7 @@ _ROUNDED_S = 5e-4  # largest error of a stamp written in milliseconds
 _FEW = 10  # number of poses below which their error has little meaning
 _FEWEST_AFTER_START = 4  # pairs with the first pose, of which three remain: as many as a rigid alignment takes
 _ROUNDING_SHARE = 0.1  # share of the reference's median interval that either error is at most
-_KITTI_FIELDS = 12
+_KITTI_FIELDS = 12  # numbers of a line: the upper three rows of a pose
 _SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's scans
 
 

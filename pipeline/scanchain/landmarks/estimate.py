@@ -15,7 +15,7 @@ from scanchain.landmarks.problem import BearingRangeProblem, Linearization, Meas
 from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
 
 _FIRST, _GROWTH = 16, 2  # number of poses of the first part, and growth factor of each further one
-_STEPS = 2
+_STEPS = 2  # iterations of the optimizer on each part
 _CONVEX = RobustLoss("huber", 1.345, 1.0)
 
 
@@ -111,7 +111,7 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
     return poses
 
 
-_FREEDOM = 4.0
+_FREEDOM = 4.0  # ν of Student's t: heavy tails with a finite variance
 _SCALE2 = _FREEDOM + 2.0  # up to a factor absorbed by σ, the weight (ν + 2) / (ν + χ²) is s² / (s² + χ²)
 
 

@@ -15,9 +15,9 @@ from scanchain.landmarks.estimate import Minimum, StudentLoss, from_odometry, gr
 from scanchain.landmarks.files import RangeLog
 from scanchain.landmarks.problem import BearingRangeProblem, Calibration, Measurements, Values
 from scanchain.landmarks.solvers import ESTIMATOR, Covariance, create_solver
+from scanchain.trajectory import LEAST_VARIANCE
 
 _AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² per second, whether or not the robot moves
-_LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion of zero duration invertible
 
 OWN = ("forward scale", "forward lost in turning", "turn scale", "drift", "delay")
 OWN_UNITS = ("", " m/rad", "", " rad/m", " s")
@@ -73,7 +73,7 @@ def reckon(log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64]
     for column, step in enumerate(np.diag(_STEP)):
         ahead, _ = _integrated(log, nodes_s, own + step, sources=0)
         slope[..., column] = (ahead - motion) / _STEP[column]
-    rest = np.diff(nodes_s)[:, None, None] * np.diag(_AT_REST) + _LEAST_VARIANCE * np.eye(3)
+    rest = np.diff(nodes_s)[:, None, None] * np.diag(_AT_REST) + LEAST_VARIANCE * np.eye(3)
     return Reckoning(motion, sources, rest, Calibration(OWN, own, slope, _SIGMA))
 
 

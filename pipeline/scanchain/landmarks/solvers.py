@@ -21,7 +21,7 @@ from scanchain.kernels.landmarks import algebra
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern, landmark_columns, pose_columns
 
 LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
-_NAMED = 6
+_NAMED = 6  # largest number of unknowns that an error names
 
 
 @dataclass(frozen=True, slots=True)

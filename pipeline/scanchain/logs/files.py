@@ -14,12 +14,11 @@ from typing import Any, TypeVar
 
 from scanchain.download import fetch
 from scanchain.errors import InputError, MissingExtraError, spelled
-from scanchain.files import Address, Source
+from scanchain.files import ATTEMPTS, SILENCE_S, Address, Source
 
 T = TypeVar("T")
-_ATTEMPTS = 4  # number of requests before an error that may be transient is final
 _PAUSE_S = 0.5  # pause after the first failure; twice as long after each further one
-_CONNECT_S, _SILENCE_S = 10.0, 30.0  # timeouts for connecting, and while waiting for data
+_CONNECT_S = 10.0  # longest time until a server answers
 _ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
 
 _BLOCK_BYTES = 8_000_000  # size of the requests of a download
@@ -86,7 +85,7 @@ def _system_of(address: Address) -> tuple[Any, str]:
         from fsspec.core import url_to_fs
     except ImportError as error:
         raise MissingExtraError(str(error.name).partition(".")[0], "remote") from None
-    silence = ClientTimeout(total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)  # a large file takes long
+    silence = ClientTimeout(total=None, sock_connect=_CONNECT_S, sock_read=SILENCE_S)  # a large file takes long
     is_web = address.url.lower().startswith(("http://", "https://"))
     try:
         return url_to_fs(address.url, **({"client_kwargs": {"timeout": silence}} if is_web else {}))
@@ -98,7 +97,7 @@ def _system_of(address: Address) -> tuple[Any, str]:
 
 def _patient(ask: Callable[[], T], what: str) -> T:
     """Result of a request, retried after errors that may be transient."""
-    for attempt in range(1, _ATTEMPTS + 1):
+    for attempt in range(1, ATTEMPTS + 1):
         try:
             return ask()
         except Exception as error:  # each file system raises errors of its own libraries
@@ -109,8 +108,8 @@ def _patient(ask: Callable[[], T], what: str) -> T:
             reason = "not found" if is_absent else " ".join(text.split()) or type(cause).__name__
             if hopeless := _hopeless(error, status):
                 raise InputError(f"{what}: {hopeless} ({reason})") from error
-            if attempt == _ATTEMPTS:
-                raise InputError(f"{what}: cannot be read ({reason}); requested {_ATTEMPTS} times") from error
+            if attempt == ATTEMPTS:
+                raise InputError(f"{what}: cannot be read ({reason}); requested {ATTEMPTS} times") from error
             sleep(_PAUSE_S * 2 ** (attempt - 1))
     raise AssertionError
 

@@ -11,6 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping
+from enum import IntEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,7 +22,7 @@ from scanchain import lie
 from scanchain.data import Points
 from scanchain.errors import InputError, one_line
 from scanchain.maps.occupancy_grid import FREE_PROBABILITY, OCCUPIED_PROBABILITY, OccupancyGrid
-from scanchain.processes import KilledFor, Limits, available_mib, die_first, die_with_parent, run_within
+from scanchain.processes import KilledFor, die_first, die_with_parent, reading_limits, run_within
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _PLY_COMMENT = "scanchain, meters, world frame"
@@ -37,12 +38,19 @@ VIEWPOINT 0 0 0 1 0 0 0
 POINTS {count}
 DATA binary
 """
-_SCALE_M = 0.001  # LAZ coordinates are whole multiples of it
-_LAS_S, _LAS_S_PER_MIB = 30.0, 1.0  # largest time to decode a file; a MiB takes about 0.05 s
-_LAS_MIB, _LAS_TIMES = 1024.0, 100.0  # largest memory, and times the size of the file
+STEP_M = 0.001  # of coordinates on disk; of keyframes that reach farther than 33 m it is larger
 
 _PGM = re.compile(rb"P5\n(\d+) (\d+)\n255\n(.*)", re.DOTALL)
-_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # pixels of ROS's map_saver
+
+
+class Pixel(IntEnum):
+    """Pixels of ROS's map_saver."""
+
+    OCCUPIED = 0
+    UNKNOWN = 205
+    FREE = 254
+
+
 # Thresholds that select exactly these three pixels, p = (255 − pixel) / 255, as nav2's own saver writes them: with
 # the common free_thresh 0.25 the unknown pixel, p = 0.196, would be read as free.
 _YAML = """image: map.pgm
@@ -93,7 +101,7 @@ def write_laz(path: Path | str, points: Points) -> None:
     rows = lie.lift_points(points)
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.generating_software = "scanchain"
-    header.scales = np.full(3, _SCALE_M)
+    header.scales = np.full(3, STEP_M)
     header.offsets = np.floor(rows.min(axis=0)) if len(rows) else np.zeros(3)
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = rows.T
@@ -102,12 +110,11 @@ def write_laz(path: Path | str, points: Points) -> None:
 
 def read_las(path: Path) -> Points:
     """Points (N, 3) of a LAS or LAZ file. Raises InputError for a damaged one, OSError where it is absent."""
-    size_mib = path.stat().st_size / 2**20
-    limits = Limits(_LAS_S + _LAS_S_PER_MIB * size_mib, min(_LAS_MIB + _LAS_TIMES * size_mib, available_mib()))
+    limits = reading_limits(path)
     with TemporaryDirectory(prefix="scanchain-") as folder:
         points, output = Path(folder) / "points.npy", Path(folder) / "output.txt"
         words = [str(path.resolve()), str(points)]
-        ending = run_within(limits, "scanchain.maps.files", words, os.environ, output=output, interval_s=0.02)
+        ending = run_within(limits, "scanchain.maps.files", words, os.environ, output=output)
         if ending.killed_for is KilledFor.NOTHING and ending.code == 0:
             return np.load(points)
         lines = output.read_text("utf-8", "replace").splitlines()
@@ -137,9 +144,9 @@ def write_map(folder: Path | str, grid: OccupancyGrid) -> None:
     occupied, white ones free, gray ones unknown; an empty grid becomes a single unknown pixel.
     """
     probability = grid.probability() if grid.log_odds.size else np.full((1, 1), 0.5)
-    image = np.full(probability.shape, _UNKNOWN, np.uint8)
-    image[probability > OCCUPIED_PROBABILITY] = _OCCUPIED
-    image[probability < FREE_PROBABILITY] = _FREE
+    image = np.full(probability.shape, Pixel.UNKNOWN, np.uint8)
+    image[probability > OCCUPIED_PROBABILITY] = Pixel.OCCUPIED
+    image[probability < FREE_PROBABILITY] = Pixel.FREE
     rows, columns = image.shape
     (Path(folder) / "map.pgm").write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + image[::-1].tobytes())
     x_m, y_m = grid.origin_m.tolist()
@@ -167,7 +174,11 @@ def read_map(folder: Path | str) -> tuple[NDArray[np.int8], float, tuple[float, 
     pixels = np.frombuffer(image[3], np.uint8)
     if len(pixels) != rows * columns:
         raise InputError(f"{folder / 'map.pgm'}: has {len(pixels)} pixels instead of {rows} × {columns}")
-    cells = np.select([pixels == _FREE, pixels == _OCCUPIED], [0, 100], -1).astype(np.int8).reshape(rows, columns)
+    cells = (
+        np.select([pixels == Pixel.FREE, pixels == Pixel.OCCUPIED], [0, 100], -1)
+        .astype(np.int8)
+        .reshape(rows, columns)
+    )
     resolution_m, x_m, y_m = (float(number) for number in header.groups())
     return np.ascontiguousarray(cells[::-1]), resolution_m, (x_m, y_m)
 

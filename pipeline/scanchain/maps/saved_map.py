@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 
 from scanchain.data import Keyframe, Matrix, Points, RaySpan
 from scanchain.errors import InputError, one_line, printable, shown
-from scanchain.files import write_whole
+from scanchain.files import BLOCK_BYTES, write_whole
+from scanchain.maps.files import STEP_M
 
 MAP_FOLDER = "map"
-VERSION = 3
+VERSION = 3  # of the format; older ones are refused
 _INDEX, _KEYFRAMES, _EDGES, _POINTS = "map.json", "keyframes.npz", "edges.npz", "points.i16"
 _NUMBER, _WIDE = np.dtype("<i2"), np.dtype("<i4")
 _ROW = np.dtype([
@@ -36,10 +37,8 @@ _ROW = np.dtype([
     ("scan_index", np.int64), ("traveled_m", np.float64), ("scale", np.float64),
 ])  # fmt: skip
 _WHOLE = ("session", "count", "stamps_ns", "scan_index", "pairs")  # arrays of whole numbers
-_STEP_M = 0.001  # of coordinates on disk, larger where the keyframe reaches farther than 33 m
 _MOST_STEP_M = 1e6  # largest step in a map whose points are not damaged
 _WIDE_FROM_M = 0.01  # step above which they take 32 bits: one far return must not make all points coarse
-_BLOCK = 1 << 20
 
 
 class Session(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -155,7 +154,7 @@ def write_saved_map(saved: SavedMap) -> None:
             reach_m = float(np.abs(points).max(initial=0.0))
             is_wide = reach_m > _WIDE_FROM_M * np.iinfo(_NUMBER).max
             number = _WIDE if is_wide else _NUMBER
-            step_m = max(reach_m / np.iinfo(number).max, _STEP_M)
+            step_m = max(reach_m / np.iinfo(number).max, STEP_M)
             file.write(np.rint(points / step_m).astype(number).tobytes())
             stored = len(points), step_m, is_wide
             rows[place] = *stored, each.stamp_ns, each.scan_index, each.traveled_m, each.scale
@@ -263,7 +262,7 @@ def _crc32(path: Path) -> int:
     """CRC-32 of a file, which detects any few flipped bits."""
     crc = 0
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
+        while block := file.read(BLOCK_BYTES):
             crc = zlib.crc32(block, crc)
     return crc
 

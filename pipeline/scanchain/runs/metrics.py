@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.data import BACK_END, VERIFICATION, State, Trajectory, fit_text
-from scanchain.errors import InputError, counted, folded
+from scanchain.errors import FIRST, InputError, counted, folded
 from scanchain.evaluation import ExpectedError, Pairs, absolute_error_of_any_path, kitti_error_of_any_path, pair
 from scanchain.evaluation.errors import far_off, path_length
 from scanchain.runs.results import Results
@@ -20,7 +20,6 @@ from scanchain.steps import STAGES
 from scanchain.verdict import Judged, Segment, Verdict
 
 VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and indent of the reasons below it
-_FIRST = 3  # number of reasons that a terminal shows
 _BY_STAGE = ("ms per scan", "  median", "  95th perc.")  # first words of lines that it omits
 _CONDITIONS = {
     Verdict.TRUSTWORTHY: "",
@@ -235,8 +234,8 @@ def shortened(summary: str) -> str:
     """A summary for a terminal: lines wrapped, with the first reasons only, without times by stage."""
     lines = [line for line in summary.splitlines() if not line.startswith(_BY_STAGE)]
     reasons = [line for line in lines if line.startswith(REASON)]
-    more = [f"{REASON}{len(reasons) - _FIRST:,} more in summary.txt"] if len(reasons) > _FIRST else []
-    return folded("\n".join([*lines[:1], *reasons[:_FIRST], *more, *lines[1 + len(reasons) :]])) + "\n"
+    more = [f"{REASON}{len(reasons) - FIRST:,} more in summary.txt"] if len(reasons) > FIRST else []
+    return folded("\n".join([*lines[:1], *reasons[:FIRST], *more, *lines[1 + len(reasons) :]])) + "\n"
 
 
 def removed(points: int) -> str:

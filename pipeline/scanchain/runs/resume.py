@@ -48,7 +48,7 @@ from scanchain.trajectory import write_tum
 _LEISURE = 20.0  # minimum ratio of the time between two checkpoints to the time to write one
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", CHECKPOINT_FILE, POINTS_FILE)
-_KEY_BYTES = _SIGNATURE_BYTES = 32
+_KEY_BYTES = 32  # of a key, and of a signature by SHA-256
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
     """
     path = folder / CHECKPOINT_FILE
     data = path.read_bytes()
-    body, signature = data[:-_SIGNATURE_BYTES], data[-_SIGNATURE_BYTES:]
+    body, signature = data[:-_KEY_BYTES], data[-_KEY_BYTES:]
     if not hmac.compare_digest(hmac.digest(_key(), body, "sha256"), signature):
         raise InputError(
             f"{path}: is damaged, or of another user or machine: not signed with {_key_file()}; {_REMEDY}"

@@ -29,16 +29,13 @@ from rerun.error_utils import RerunWarning
 
 from scanchain.errors import InputError, counted
 from scanchain.files import write_whole
-from scanchain.processes import KilledFor, Limits, available_mib, die_first, die_with_parent, run_within
+from scanchain.processes import LOOK_S, KilledFor, die_first, die_with_parent, reading_limits, run_within
 from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.entities import UP
 
-_QUEUED_BATCHES = 16
+_QUEUED_BATCHES = 16  # largest number of batches in memory that wait to be written
 _COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is copied
-_LOOK_EVERY_S = 0.1
-_FILE_PATIENCE_S = 10.0
-_VIEWER_PATIENCE_S = 5.0
-_READ_S, _READ_MIB, _READ_TIMES = 60.0, 1024.0, 50.0  # limits of reading: s, MiB, MiB per MiB of its size
+_FILE_PATIENCE_S, _VIEWER_PATIENCE_S = 10.0, 5.0  # time without progress after which writing is abandoned
 _open: set[rr.RecordingStream] = set()  # those that are open or were not closed cleanly
 
 
@@ -86,7 +83,7 @@ class Sink:
             with contextlib.suppress(queue.Full):
                 self.waiting.put(lambda stream: settled.set(), timeout=self.patience_s)
             flushes, since_s = self.flushes, perf_counter()
-            while not settled.wait(_LOOK_EVERY_S) and not self.warnings:
+            while not settled.wait(LOOK_S) and not self.warnings:
                 if flushes != self.flushes:
                     flushes, since_s = self.flushes, perf_counter()
                 elif perf_counter() - since_s > self.patience_s:
@@ -141,11 +138,9 @@ class Sink:
 
 def is_readable(path: Path) -> bool:
     """True if a recording can be read; tried in a separate process, since rerun aborts on damaged sizes."""
-    size_mib = path.stat().st_size / 2**20
-    limits = Limits(_READ_S + size_mib, min(_READ_MIB + _READ_TIMES * size_mib, available_mib()))
     with TemporaryDirectory(prefix="scanchain-") as folder:
         output = Path(folder) / "output.txt"
-        ending = run_within(limits, __name__, [str(path.resolve())], os.environ, output=output, interval_s=0.02)
+        ending = run_within(reading_limits(path), __name__, [str(path.resolve())], os.environ, output=output)
     return ending.killed_for is KilledFor.NOTHING and ending.code == 0
 
 

@@ -31,7 +31,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from scanchain.errors import InputError, counted
-from scanchain.files import Source
+from scanchain.files import BLOCK_BYTES, Source
 from scanchain.logs.files import RemoteFile
 from scanchain.logs.formats import Format
 from scanchain.logs.index import (
@@ -58,8 +58,6 @@ _DATA_END = RECORD.pack(Opcode.DATA_END, 4)
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
 _TAIL_BYTES = 65_536  # bytes read from the end of a file first; most summaries fit, so one request suffices
 _LONGEST_NAME = 16  # bytes of the name of a compression; known ones have 3 or 4
-_LOOSE_BYTES = 1 << 20  # size of the blocks in which messages outside of chunks are read
-_WINDOW = 1 << 20  # bytes that are searched for a record at once; limits memory
 
 
 def index_file(path: Path, number: int) -> FileIndex:
@@ -225,7 +223,7 @@ class Walk:
             self._close(offset, complete=True)
 
     def _add_message(self, offset: int, end: int) -> None:
-        if self.open is None or self.open.head or end - self.open.offset > _LOOSE_BYTES:
+        if self.open is None or self.open.head or end - self.open.offset > BLOCK_BYTES:
             self._close(offset, complete=True)
             self.open = Block(self.index.number, offset, 0, "", 0, 0, 0, Counter())
         channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.data, offset + RECORD.size)
@@ -338,8 +336,8 @@ def _opcodes_after_damage(index: FileIndex) -> tuple[int, ...]:
 def _next_record(index: FileIndex, offset: int, opcodes: tuple[int, ...]) -> int:
     """First byte from ``offset`` on where a record with such an opcode, or a truncated chunk, begins; else 0."""
     data = index.data
-    for begin in range(offset, len(data) - RECORD.size, _WINDOW):
-        window = np.frombuffer(data, np.uint8, min(_WINDOW + 8, len(data) - begin), begin)
+    for begin in range(offset, len(data) - RECORD.size, BLOCK_BYTES):
+        window = np.frombuffer(data, np.uint8, min(BLOCK_BYTES + 8, len(data) - begin), begin)
         likely = np.isin(window[:-8], opcodes) & ((window[6:-2] | window[7:-1] | window[8:]) == 0)
         for candidate in (begin + np.flatnonzero(likely)).tolist():
             end = _record_end(index, candidate)

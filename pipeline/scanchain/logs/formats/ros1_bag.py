@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
+from enum import IntEnum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +28,19 @@ from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message, m
 from scanchain.logs.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+
+
+class Op(IntEnum):
+    """Opcodes of records."""
+
+    MESSAGE = 2
+    HEADER = 3
+    INDEX = 4
+    CHUNK = 5
+    CHUNK_INFO = 6
+    CONNECTION = 7
+
+
 Data = mmap.mmap | memoryview | bytes
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
@@ -35,8 +48,8 @@ _COUNT = struct.Struct("<II")  # connection, number of its messages
 _ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
 _LONGEST_HEAD = 1 << 16  # bytes; a longer head of a record is damage
 _FIELDS = {  # a field that identifies each type of record; "count" is checked last
-    MESSAGE: b"time", HEADER: b"index_pos", CHUNK: b"compression", CHUNK_INFO: b"chunk_pos", CONNECTION: b"topic",
-    INDEX: b"count",
+    Op.MESSAGE: b"time", Op.HEADER: b"index_pos", Op.CHUNK: b"compression", Op.CHUNK_INFO: b"chunk_pos",
+    Op.CONNECTION: b"topic", Op.INDEX: b"count",
 }  # fmt: skip
 _OUTSIDE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
 _INSIDE = re.compile(rb"\x04\0\0\0op=[\x02\x07]")  # of a chunk: opcode of a message, a connection
@@ -107,7 +120,7 @@ def read_records(
             continue
         resumed = next_record(data, offset, offset if record is None else record.end, opcodes)
         limit = len(data) if resumed is None else resumed.offset
-        if record is not None and (record.end <= limit or (resumed is None and record.opcode == CHUNK)):
+        if record is not None and (record.end <= limit or (resumed is None and record.opcode == Op.CHUNK)):
             yield record
         gaps.append((offset, limit))
         offset, record = limit, resumed
@@ -124,7 +137,7 @@ def next_record(data: Data, offset: int, stated_end: int, opcodes: re.Pattern[by
             record = read_record(data, begin)
             if record is None or record.begin < match.end() or record.end > len(data):
                 continue
-            if record.opcode != CONNECTION or begin >= stated_end:
+            if record.opcode != Op.CONNECTION or begin >= stated_end:
                 return record
     return None
 
@@ -189,13 +202,13 @@ def _walk(index: FileIndex) -> dict[int, dict[int, int]]:
 
 def _add_record(index: FileIndex, record: Record, stated: dict[int, dict[int, int]]) -> None:
     """Add a record to the index. Raises struct.error or ValueError if it is malformed."""
-    if record.opcode == CONNECTION:
+    if record.opcode == Op.CONNECTION:
         _define(index, record, index.data)
-    elif record.opcode == CHUNK:
+    elif record.opcode == Op.CHUNK:
         index.blocks.append(_chunk(index, record))
-    elif record.opcode == INDEX and index.blocks:
+    elif record.opcode == Op.INDEX and index.blocks:
         index.blocks[-1] = _indexed(index, record)
-    elif record.opcode == CHUNK_INFO:
+    elif record.opcode == Op.CHUNK_INFO:
         counts = _COUNT.iter_unpack(index.data[record.begin : record.end])
         begin = int.from_bytes(record.fields[b"chunk_pos"], "little")
         stated[begin] = {connection: count for connection, count in counts if count}
@@ -261,9 +274,9 @@ def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Con
     payload = unpack(index, block)
     for record in read_records(payload, 0, _INSIDE, gaps):
         try:
-            if record.opcode == CONNECTION:
+            if record.opcode == Op.CONNECTION:
                 _define(index, record, payload)
-            elif record.opcode == MESSAGE:
+            elif record.opcode == Op.MESSAGE:
                 seconds, nanoseconds = _TIME.unpack(record.fields.get(b"time", b""))
                 number = record.number(b"conn")
                 read[number] += 1

@@ -20,6 +20,7 @@ import zstandard
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, one_line
+from scanchain.files import BLOCK_BYTES
 from scanchain.logs.files import size_of
 from scanchain.logs.formats import Format
 from scanchain.logs.index import (
@@ -211,7 +212,7 @@ def _decompress(file: Path, decompressed: Path) -> None:
     most = most_decompressed_file(file.stat().st_size)
     with file.open("rb") as stored, decompressed.open("wb") as copy, suppress(zstandard.ZstdError):
         reader = zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True)
-        while data := reader.read(1 << 20):
+        while data := reader.read(BLOCK_BYTES):
             copy.write(data)
             if copy.tell() > most:
                 raise InputError(f"{file}: decompresses to more than {most:,} bytes; is it a ROS 2 bag?")
