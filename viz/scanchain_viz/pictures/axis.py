@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 FONT = 8.0  # height of text in points
 _DIGIT = 0.64  # width of a digit as a fraction of the text height
-_GAP = 4.0  # smallest gap between two numbers in points
-_MARGIN = 0.05  # margin on either side, as a fraction of the range of the values
+GAP = 4.0  # least distance between two texts in points
+MARGIN = 0.05  # margin on either side, as a fraction of the range of the values
 _MOST = 10  # largest number of ticks
 _ROUND = "125"  # steps between ticks, times a power of ten
 _DECADES = ("125", 1), ("13", 1), ("1", 1), ("1", 2), ("1", 3), ("1", 10), ("1", 50)  # ticks, in every n-th decade
@@ -53,9 +53,9 @@ class Axis:
         low, high = (self._least, self._greatest) if self._least <= self._greatest else (1.0, 1.0)
         if self.is_logarithmic:
             low, high = (low, high) if high > low else (0.1 * low, 10.0 * high)
-            more = (high / low) ** _MARGIN
+            more = (high / low) ** MARGIN
             return low / more, high * more
-        spare = _MARGIN * (high - low) or _MARGIN * (abs(low) or 1.0)
+        spare = MARGIN * (high - low) or MARGIN * (abs(low) or 1.0)
         return low - spare, high + spare
 
     def fractions(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -72,7 +72,7 @@ class Axis:
             places = self.fractions(np.array(values, np.float64))
             sizes = np.array([FONT if is_upright else width_of(text) for text in texts])
             room = length * np.abs(np.diff(places)) - 0.5 * (sizes[1:] + sizes[:-1])
-            if len(values) <= _MOST and room.min(initial=_GAP) >= _GAP:
+            if len(values) <= _MOST and room.min(initial=GAP) >= GAP:
                 labels = [text.replace("-", "−") for text in texts]
                 return list(zip(places.tolist(), labels, strict=True))
         raise AssertionError("the largest step has one tick at most")

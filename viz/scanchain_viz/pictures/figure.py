@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from scanchain.files import write_whole
-from scanchain_viz.pictures.axis import FONT, Axis, width_of
+from scanchain_viz.pictures.axis import FONT, GAP, MARGIN, Axis, width_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,22 +29,39 @@ Positions = NDArray[np.floating]
 Pixels = NDArray[np.uint8]
 
 INK = "var(--ink)"  # the page's own color of text
-THIN, DOTS = 0.8, (1.0, 1.5)  # width and dashes, in widths, of a dotted line
-DASHED = (3.0, 3.0)
+THIN = 0.8  # width of a dotted line in points
+DOTS, DASHED = (1.0, 1.5), (3.0, 3.0)  # lengths of dashes and gaps, in widths of the line
+MIDDLE = (0.5, 99.5)  # percentiles of values that are shown at least
 _INCH = 72.0  # points, the unit of the drawing
-_WIDTH, _WHOLE = 4.6, 9.6  # inches: of a figure next to another, of one across the page; same text size
-_LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
-_LOWEST, _HIGHEST, _HIGHEST_WHOLE = 1.5, 5.2, 6.5  # least and greatest heights of a plan in inches
-_TICK = 3.5  # length of a tick, and its distance from the number
+_LOWEST = 1.5  # least height of a plan in inches
+_TICK = 3.5  # length of a tick, and its distance from the number, in points
 _ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # height of text above and below its baseline
-_LABEL = 4.0  # distance of a label from the numbers
 _SAME = 0.1  # points; successive positions of a line that are closer are merged
 _FAR = 1e5  # points beyond which nothing is drawn
 _LEVEL = 3  # PNG compression: a higher level takes twice as long and saves a tenth
 _FRAME = "#cccccc"  # of axes on white
 _PANEL_INCHES = (2.0, 12.0)  # least and greatest height of a figure in a PNG
 _TITLE_INCHES = 0.77  # room for its title and labels
-_TITLE_FONT, _LABEL_FONT = 11.0, 9.0  # heights of their text in points
+
+
+class Layout(NamedTuple):
+    """Width of a figure, and greatest height of a plan, in inches; the size of the text is the same in all."""
+
+    width: float
+    highest: float
+
+
+class Margins(NamedTuple):
+    """Inches around the axes: room for numbers and labels."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+
+
+_NEXT_TO_ANOTHER, _ACROSS_THE_PAGE = Layout(4.6, 5.2), Layout(9.6, 6.5)
+_MARGINS = Margins(left=0.8, right=0.2, bottom=0.45, top=0.12)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,15 +112,16 @@ class Plot:
 
     def _lay_out(self, *, is_wide: bool) -> None:
         """Set the size of the figure, corner and extent of its axes; in a plan, their scales are equal."""
-        width, height, shape = _WHOLE if is_wide else _WIDTH, self.height_inches, np.array(self.proportions)
-        room = width - _LEFT - _RIGHT
+        width, highest = _ACROSS_THE_PAGE if is_wide else _NEXT_TO_ANOTHER
+        height, shape = self.height_inches, np.array(self.proportions)
+        left, right, bottom, top = _MARGINS
+        room = width - left - right
         if shape[0]:
-            height = room * shape[1] / shape[0] + _BOTTOM + _TOP
-            height = float(np.clip(height, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST))
-        room = _INCH * np.array([room, height - _BOTTOM - _TOP])
+            height = float(np.clip(room * shape[1] / shape[0] + bottom + top, _LOWEST, highest))
+        room = _INCH * np.array([room, height - bottom - top])
         self.size = _INCH * width, _INCH * height
         self.extent = np.min(room / shape) * shape if shape[0] else room
-        self.corner = _INCH * np.array([_LEFT, _TOP]) + 0.5 * (room - self.extent)  # on the left and above
+        self.corner = _INCH * np.array([left, top]) + 0.5 * (room - self.extent)  # on the left and above
 
     def line(
         self, positions: Positions, color: str, width: float = 1.2, dashes: Sequence[float] = (), *, name: str = ""
@@ -222,10 +240,10 @@ class Plot:
         grid = [f"M{x:.2f} {bottom:.2f}v{-height:.2f}" for x, _ in across if self.has_grid]
         grid += [f"M{left:.2f} {y:.2f}h{width:.2f}" for y, _ in up if self.has_grid]
         below = bottom + 2.0 * _TICK + _ABOVE
-        aside = left - 2.0 * _TICK - max((width_of(text) for _, text in up), default=0.0) - _LABEL - _BELOW
+        aside = left - 2.0 * _TICK - max((width_of(text) for _, text in up), default=0.0) - GAP - _BELOW
         texts = [_text(x, below, text) for x, text in across]
         texts += [_text(left - 2.0 * _TICK, y + 0.5 * _ABOVE, text, "end") for y, text in up]
-        texts.append(_text(left + 0.5 * width, below + FONT + _LABEL, self.x.label))
+        texts.append(_text(left + 0.5 * width, below + FONT + GAP, self.x.label))
         texts.append(
             _text(aside, middle, self.y.label, turned=f' transform="rotate(-90 {aside:.2f} {middle:.2f})"')
         )
@@ -272,11 +290,11 @@ def broken(segments: Positions) -> Floats:
     return np.concatenate([segments, gaps], axis=1).reshape(-1, segments.shape[-1])
 
 
-def around(points: Positions, share: float, least: float) -> tuple[Floats, Floats]:
-    """Corners (d,) around the finite points of (N, d), with a margin: ``share`` of their extent or ``least``."""
+def around(points: Positions, least: float = 1.0) -> tuple[Floats, Floats]:
+    """Corners (d,) around the finite points of (N, d), with a margin of at least that many meters."""
     known = points[np.isfinite(points).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
-    margin = max(share * float((high - low).max()), least)
+    margin = max(MARGIN * float((high - low).max()), least)
     return low - margin, high + margin
 
 
@@ -296,16 +314,14 @@ def write_png(path: Path, panels: Sequence[tuple[str, Plot]], *, width_inches: f
         for draw in plot.on_axes:
             draw(axes)
         axes.set(xlim=plot.x.ends, ylim=plot.y.ends, aspect="equal" if plot.proportions[0] else "auto")
-        axes.set_title(title, loc="left", fontsize=_TITLE_FONT)
-        axes.set_xlabel(plot.x.label, fontsize=_LABEL_FONT)
-        axes.set_ylabel(plot.y.label, fontsize=_LABEL_FONT)
-        axes.tick_params(labelsize=_LABEL_FONT, color=_FRAME)
+        axes.set_title(title, loc="left")
+        axes.set_xlabel(plot.x.label)
+        axes.set_ylabel(plot.y.label)
+        axes.tick_params(color=_FRAME)
         axes.spines[:].set_color(_FRAME)
         named |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if named:
-        figure.legend(
-            [*named.values()], [*named], loc="outside lower center", ncols=5, frameon=False, fontsize=_LABEL_FONT
-        )
+        figure.legend([*named.values()], [*named], loc="outside lower center", ncols=5, frameon=False)
     picture = BytesIO()
     figure.savefig(picture, facecolor="white", format="png", dpi=150, bbox_inches="tight")
     write_whole(path, picture.getvalue())

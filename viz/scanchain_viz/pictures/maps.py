@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,38 +21,55 @@ from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Segment
 from scanchain_viz.colors import ODOMETRY, OPTIMIZED, TRUTH, color_of, color_of_kind, height_shares, palette_of
-from scanchain_viz.pictures.figure import DASHED, INK, Floats, Line, Plot, around, write_png
+from scanchain_viz.pictures.axis import MARGIN
+from scanchain_viz.pictures.figure import DASHED, INK, MIDDLE, Floats, Line, Plot, around, write_png
 
 Grid = tuple[NDArray[np.int8], float, tuple[float, float]]  # as ``read_map`` returns it
 
 GRAY = "#808893"  # of points of a map beneath lines
-_MAX_POINTS = 120_000
-_SAMPLE = 200_000  # points sampled from a map's keyframes
-_PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # width of a picture: per square root of its points; limits
-_SHADES, _HEIGHTS = 6, 36  # numbers of opacities and of colors of heights; a PNG has 256 colors
 VIRIDIS = (
     "440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c", "1fa088", "28ae80",
     "3fbc73", "5ec962", "84d44b", "addc30", "d8e219", "fde725",
 )  # fmt: skip
-_OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # number of points up to which each is opaque; range of opacities
-_BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; share of their range that a point may lie beyond
-_ALL_BUT_FEW, _MARGIN = (0.05, 99.95), 0.02  # percentiles shown; margin as a share of their range
-_PNG_INCHES, _PNG_MARGIN = 8.0, (0.04, 1.0)  # width; margin: share of the extent, least meters
+_REACH = 0.5  # share of the range of ``MIDDLE`` beyond which a point of a map is an outlier
+_ALL_BUT_FEW = (0.05, 99.95)  # percentiles of the other points that are shown
+_PNG_INCHES = 8.0  # width of a PNG
 _NO_POINTS = np.empty((0, 3))
 _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of 3D points, by height
+
+
+class PointStyle(NamedTuple):
+    """How points of a map become an image, which is part of the page.
+
+    most : largest number of points; further ones are left out
+    pixels_per_root, widths : width of the image per square root of its points, and its limits, pixels
+    shades, heights : numbers of opacities, and of colors of heights: a PNG has a palette of 256
+    opaque, opacities : number of points up to which each is opaque; range of their opacity
+    """
+
+    most: int = 120_000
+    pixels_per_root: float = 2.0
+    widths: tuple[float, float] = (200.0, 700.0)
+    shades: int = 6
+    heights: int = 36
+    opaque: int = 40_000
+    opacities: tuple[float, float] = (0.4, 1.0)
+
+
+_STYLE = PointStyle()
 
 
 def surroundings(positions: NDArray[np.floating], clouds: Sequence[Points]) -> tuple[Floats, Floats]:
     """Corners (3,) around positions (N, 3) and, except for outliers, the points of maps (M, 3) with a margin."""
     boxes = np.array([extent(points) for points in clouds if len(points)]).reshape(-1, 2, 3)
-    boxes += _MARGIN * np.ptp(boxes, axis=1, keepdims=True) * np.array([[-1.0], [1.0]])
+    boxes += MARGIN * np.ptp(boxes, axis=1, keepdims=True) * np.array([[-1.0], [1.0]])
     held = np.concatenate([positions, *boxes])
     return held.min(axis=0), held.max(axis=0)
 
 
 def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
     """Corners (d,) of a map (M, d) without outliers: few points, far outside of the middle 99 % along any axis."""
-    low, high = np.percentile(points, _BULK, axis=0)
+    low, high = np.percentile(points, MIDDLE, axis=0)
     size = high - low
     size[:2] = size[:2].max()
     inside = points[((points >= low - _REACH * size) & (points <= high + _REACH * size)).all(axis=1)]
@@ -62,7 +79,7 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
 
 def map_points(prior: SavedMap) -> Points:
     """(N, 3) points sampled from all keyframes of a map, in its frame."""
-    each = max(_SAMPLE // max(len(prior.keyframes), 1), 1)
+    each = max(_STYLE.most // max(len(prior.keyframes), 1), 1)
     clouds = [np.empty((0, 3))]
     for keyframe in prior.keyframes:
         points = keyframe.points
@@ -108,24 +125,27 @@ def draw_points(
 
     grain_m : distance of neighboring points and least edge of a pixel; 0 if unknown
     """
-    points = points[:: max(1, -(-len(points) // _MAX_POINTS))]
+    points = points[:: max(1, -(-len(points) // _STYLE.most))]
     points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)]
     if not len(points):
         return
     colors = colors if len(colors) == 1 or np.ptp(points[:, 2]) else (GRAY,)
-    size_m, width = float(high[0] - low[0]), float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
-    edge_m = max(grain_m, size_m / _WIDTHS[1]) if grain_m else size_m / width
+    size_m, width = (
+        float(high[0] - low[0]),
+        float(np.clip(_STYLE.pixels_per_root * np.sqrt(len(points)), *_STYLE.widths)),
+    )
+    edge_m = max(grain_m, size_m / _STYLE.widths[1]) if grain_m else size_m / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
     pixel = row * columns + column
-    opacity = float(np.clip(_OPAQUE / len(points), *_OPACITIES))
-    counts = np.minimum(np.bincount(pixel, minlength=rows * columns), _SHADES)
-    shades, highest = palette_of(colors, _HEIGHTS if len(colors) > 1 else 1), np.zeros(rows * columns, int)
+    opacity = float(np.clip(_STYLE.opaque / len(points), *_STYLE.opacities))
+    counts = np.minimum(np.bincount(pixel, minlength=rows * columns), _STYLE.shades)
+    shades, highest = palette_of(colors, _STYLE.heights if len(colors) > 1 else 1), np.zeros(rows * columns, int)
     if len(shades) > 1:
         np.maximum.at(highest, pixel, np.rint((len(shades) - 1) * height_shares(points[:, 2])).astype(int))
-    palette = np.repeat(shades, _SHADES + 1, axis=0)
-    palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(_SHADES + 1))), len(shades))
-    pixels = (highest * (_SHADES + 1) + counts).reshape(rows, columns).astype(np.uint8)
+    palette = np.repeat(shades, _STYLE.shades + 1, axis=0)
+    palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(_STYLE.shades + 1))), len(shades))
+    pixels = (highest * (_STYLE.shades + 1) + counts).reshape(rows, columns).astype(np.uint8)
     figure.image(pixels, palette, low, low[:2] + edge_m * np.array(pixels.shape[::-1]))
 
 
@@ -170,7 +190,7 @@ def draw_map(
         cells, resolution_m, origin_m = grid
         seen = np.array(origin_m) + resolution_m * np.argwhere(cells > 0)[:, ::-1]
     corners = [line.positions[:, :2] for line in lines] + ([np.array(extent(seen))] if len(seen) else [])
-    low, high = around(np.concatenate(corners), *_PNG_MARGIN)
+    low, high = around(np.concatenate(corners))
     figure = over_map(lines, points, low, high, grid=grid, colors=_INKS, path=path)
     write_png(picture, [(title, figure)], width_inches=_PNG_INCHES)
 

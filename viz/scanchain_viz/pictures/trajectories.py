@@ -22,7 +22,7 @@ from scanchain.steps import STAGES
 from scanchain_viz.colors import ODOMETRY, OPTIMIZED, color_of
 from scanchain_viz.pictures.figure import Floats, around
 
-_MARGIN, _MARGIN_Z = (0.08, 1.0), (0.25, 0.1)  # shares of the extent and least meters
+_LEAST_Z_M = 0.1  # least margin of heights, which vary less than positions in the plane
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class DrawnTrajectory:
 def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> Floats:
     """Corners (2, 3) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
     held = np.concatenate([each.positions for each in trajectories]) if truth is None else truth
-    return np.hstack([around(held[:, :2], *_MARGIN), around(held[:, 2:], *_MARGIN_Z)])
+    return np.hstack([around(held[:, :2]), around(held[:, 2:], _LEAST_Z_M)])
 
 
 def trajectories_of_run(

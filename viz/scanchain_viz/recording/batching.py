@@ -12,19 +12,17 @@ import rerun as rr
 
 from scanchain import lie
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, ClosureVerdict, GraphState, Matrix, State, Step
+from scanchain.data import DOWNWEIGHTED, Closure, ClosureVerdict, GraphState, Matrix, State, Step
 from scanchain.runs.closures import final_verdicts
 from scanchain.steps import STAGES, Steps
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
 
-_MAX_SCANS = 256
-_MAX_BYTES = 4_000_000
-_MAX_WAIT_S = 0.25
+_MAX_SCANS, _MAX_BYTES = 256, 4_000_000  # a batch of scans that is written at once: number and size at most
+_MAX_WAIT_S = 0.25  # longest time until a scan is written, so that a viewer follows
 _LEAST_DRAWN = 1e-3  # smaller observability is drawn as this
 WARNING, _INFORMATION = "WARN", "INFO"  # rerun's log levels
 _GROWTH = 1.05  # growth factor between two drawings: the recording's size stays linear in the log's length
-_DOWNWEIGHTED = 0.5  # robust weight below which an accepted closure is drawn amber
 
 
 class KeyframeGraph:
@@ -83,7 +81,9 @@ class KeyframeGraph:
             return nodes[np.array(pairs, np.int64).reshape(-1, 2)]
 
         accepted = self._of(ClosureVerdict.ACCEPTED)
-        colors = [entities.PALE_GREEN if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
+        colors = [
+            entities.INKS.pale_green if item.weight < DOWNWEIGHTED else entities.INKS.green for item in accepted
+        ]
         return [
             Message(entities.KEYFRAMES, drawing.dots(nodes), times),
             Message(entities.ODOMETRY_EDGES, drawing.lines([nodes]), times),

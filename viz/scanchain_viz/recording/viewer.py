@@ -17,11 +17,10 @@ from urllib.parse import quote
 from scanchain.errors import InputError, ScanchainError
 
 HOST = "127.0.0.1"
-PORT = 9876
-WEB_PORT = 9090
-_PROBE_S = 0.3
-_START_S = 8.0
-_SETTLE_S = 0.5
+PORT, WEB_PORT = 9876, 9090  # as of rerun itself: of its viewer and of its web server
+_PROBE_S = 0.3  # longest time until a port of this machine answers
+_START_S = 8.0  # longest time until a viewer that was started listens
+_SETTLE_S = 0.5  # time that it must go on listening: one that cannot open a window ends before
 
 
 def grpc_address() -> str:

@@ -17,12 +17,12 @@ from scanchain.files import source_of, without_keys
 from scanchain.trajectory import read_tum
 from scanchain.verdict import MOST_CONTRADICTED
 from scanchain_viz.colors import color_of
+from scanchain_viz.pictures.axis import MARGIN
 from scanchain_viz.pictures.figure import Plot
 from scanchain_viz.report import page
 
-_MAX_TRAJECTORIES = 60
+_MAX_TRAJECTORIES = 60  # largest number of runs whose trajectories are drawn
 _BOX = np.array([1.0, 0.84])  # proportions of the plan of a trajectory
-_BEYOND = 1.05  # factor on the size of a plan, so that marks at its edge are not cut off
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a count is marked
 _HEADS = (
     page.Head("log"),
@@ -127,7 +127,7 @@ def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -
 def _trajectory(trajectory: Path) -> Plot:
     positions = read_tum(trajectory).poses[:, :2, -1]
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
-    half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
+    half = (0.5 + MARGIN) * (max(size / _BOX) or 1.0) * _BOX
     figure = Plot.of_plan(middle - half, middle + half, has_grid=True)
     figure.line(positions, color_of(0))
     figure.marks(positions[:1], "o", color_of(0), 5.0)

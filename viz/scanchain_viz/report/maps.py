@@ -42,7 +42,7 @@ STATE_COLORS = {
     MapState.LOST: "#d6453d",
 }
 _AFTERWARDS = "#0f9bb5"
-_ROWS, _CLOSE_UPS = 200, 12
+_CLOSE_UPS = 12  # largest number of close-ups: the largest clusters
 _AROUND_SIZE, _AROUND_M = 1.5, 1.0  # half the size of a close-up: times that of its cluster, plus meters
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
 _HEX = {label: f"#{bytes(COLORS[label]).hex()}" for label in Label}
@@ -228,10 +228,10 @@ def _cluster_grid(changes: Changes) -> page.Grid:
         *([page.Head("counterpart", hint="number of the cluster that it moved to or from")] if has_moved else ()),
     )
     rows = []
-    for each in changes.clusters[:_ROWS]:
+    for each in changes.clusters[: page.MAX_ROWS]:
         numbers = [*each.center.tolist(), *each.size_m.tolist(), each.volume]
         cells = (each.kind, *(f"{number:.2f}" for number in numbers), f"{each.points:,}")
         cells += (str(each.counterpart or ""),) if has_moved else ()
         rows.append(page.Row(str(each.number), cells))
-    left = len(changes.clusters) - _ROWS
+    left = len(changes.clusters) - page.MAX_ROWS
     return page.Grid(heads, rows, [f"and {left:,} smaller ones in {TABLE_FILE}"] if left > 0 else ())

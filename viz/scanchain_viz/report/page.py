@@ -18,16 +18,17 @@ from numpy.typing import NDArray
 from scanchain.data import Points
 from scanchain.files import write_whole
 from scanchain.verdict import Judged, Verdict
-from scanchain_viz.pictures.figure import Floats, Line, Plot
+from scanchain_viz.pictures.axis import MARGIN
+from scanchain_viz.pictures.figure import MIDDLE, Floats, Line, Plot
 from scanchain_viz.pictures.trajectories import DrawnTrajectory
 
 REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"
 SCRIPT = (_TEMPLATES / "map_viewer.js").read_text(encoding="utf-8")
+MAX_ROWS = 100  # largest number of rows of a table; the longest segments or largest clusters are kept
 _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
-_MAX_LINE_POINTS = 4_000
-_HIGHEST = 65_535.0
-_BULK, _MARGIN = (0.5, 99.5), 0.03  # percentiles of the points in the initial view; margin on each side
+_MAX_LINE_POINTS = 4_000  # largest number of points of a line: 0.03 MB of a page
+_HIGHEST = float(np.iinfo(np.uint16).max)  # coordinates have 16 bits
 _WIDEST = 3.0  # greatest width over height of a flat map's canvas
 _WIDER = 1.8  # factor on the width of lines on the canvas
 
@@ -220,10 +221,10 @@ def interactive_map(
 
 def _first_view(points: Points, lines: Sequence[Line], low: Floats, high: Floats) -> Floats:
     """Corners (2, 3) of the initial view: all lines and most points, with a margin."""
-    bulk = np.percentile(points, _BULK, axis=0) if len(points) else np.empty((0, 3))
+    bulk = np.percentile(points, MIDDLE, axis=0) if len(points) else np.empty((0, 3))
     seen = np.vstack([bulk, *(line.positions for line in lines)])
     first, last = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
-    margin = _MARGIN * (last - first)
+    margin = MARGIN * (last - first)
     return np.stack([np.maximum(first - margin, low), np.minimum(last + margin, high)])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,10 +21,9 @@ from scanchain_viz.report import page
 _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
 BEFORE, AFTER = "#e07b00", "#1f5fd0"
-_MARGIN = 0.05, 1e-3  # of a view: share of its extent, least meters
 _PIXELS = 500  # largest width in pixels of a picture of a factor
-_ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
-_ELLIPSE_POINTS = 37
+_ELLIPSE = math.sqrt(-2.0 * math.log(0.05))  # standard deviations that hold 95 % of a Gaussian in the plane
+_ELLIPSE_POINTS = 37  # vertices of an ellipse, every 10°
 _BLUES = ("f7fbff", "deebf7", "c6dbef", "9dcae1", "6aaed6", "4191c6", "2070b4", "08509b", "08306b")
 _TIMES = (
     "Times are medians; each method solves from scratch, including its analysis of the sparsity pattern (again: "
@@ -47,7 +47,7 @@ def _graph(state: GraphState) -> Plot:
     positions = state.poses[:, :-1, -1]
     is_flat = positions.shape[1] == 2
     seen = positions if is_flat else positions @ _SEEN_FROM.T
-    low, high = around(seen, *_MARGIN)
+    low, high = around(seen)
     center, half = 0.5 * (low + high), 0.5 * (high - low).max()
     low, high = center - half, center + half  # a square, since the panels stand side by side
     figure = Plot.of_plan(low, high)
@@ -80,7 +80,7 @@ def _estimates(study: Study) -> tuple[Plot, Plot]:
 def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     """An estimate over the ground truth, in the truth's frame if there is one."""
     points = [study.true_poses, study.true_landmarks, *study.before.in_truth(), *study.after.in_truth()]
-    figure = Plot.of_plan(*around(np.concatenate(points), *_MARGIN))
+    figure = Plot.of_plan(*around(np.concatenate(points)))
     poses, landmarks = estimate.in_truth()
     if len(study.true_poses):
         figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")

@@ -39,8 +39,6 @@ _ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the h
     (page.Head("KITTI rot.", "deg/m"), "kitti_rotation_rad_per_m", np.degrees(1.0), 4),
 )
 _SHADE = "#8c9096"
-_MAX_ROWS = 100  # largest number of segments in the table; the longest are kept
-_MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _DISPUTED = "at closures rejected by the back end"
 _STATES = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)  # kinds that are also states of scans
 _OVER_STATES = (Kind.OVERLAP, Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED, Kind.COPIES)
@@ -146,7 +144,7 @@ def _closure_lines(path: Floats, closures: pa.Table) -> Iterator[Line]:
     for by, (name, color) in CLOSURES.items():
         chosen = ends[rejected_by == by]
         if len(chosen):
-            drawn = chosen[:: -(-len(chosen) // _MAX_CLOSURES)]
+            drawn = chosen[:: -(-len(chosen) // sections.MAX_POINTS)]
             yield Line(f"closures {name}: {len(chosen):,}", broken(path[drawn]), color, 0.9)
 
 
@@ -182,7 +180,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
 
 def _segments(segments: Sequence[Segment]) -> page.Grid:
     """The longest segments, in the order of the log."""
-    longest = sorted(segments, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
+    longest = sorted(segments, key=lambda each: each.last - each.first, reverse=True)[: page.MAX_ROWS]
     rows = []
     for each in sorted(longest, key=lambda each: each.first):
         scans = [f"{number:,}" for number in (each.first, each.last, each.scans)]

@@ -16,14 +16,13 @@ from scipy.special import gammaincinv
 
 from scanchain.runs.provenance import Provenance
 from scanchain_viz.colors import CLOSURES, TRUTH
-from scanchain_viz.pictures.figure import DASHED, DOTS, INK, THIN, Floats, Plot
+from scanchain_viz.pictures.figure import DASHED, DOTS, INK, MIDDLE, THIN, Floats, Plot
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame
 from scanchain_viz.report import page
 from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Named, Row, Section
 
-_MAX_POINTS = 1500  # largest number of points of a line
+MAX_POINTS = 1500  # largest number of points of a line, and of lines of one kind, in a figure
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
-_SHOWN_SHARES = (0.5, 99.5)  # percentiles of a distribution that are shown
 CLIPPED = (0.01, 1000.0)  # range of observability and innovations that is drawn
 
 
@@ -139,7 +138,7 @@ def _distribution(
     """Cumulative distribution, shown up to the 99.5th percentile of the worst trajectory."""
     figure, ends = Plot(label, "share below [%]", logarithmic="x", is_wide=is_wide), []
     for each in reversed(known):
-        ends.append(np.percentile(_cumulative(figure, each, scale * getattr(each, key), 1e-6), _SHOWN_SHARES))
+        ends.append(np.percentile(_cumulative(figure, each, scale * getattr(each, key), 1e-6), MIDDLE))
     figure.x.limit(0.9 * np.min(ends), 1.1 * np.max(ends))
     figure.y.limit(0.0, 100.0)
     return Drawing.of("Distribution", f"Share of the {those}.", figure)
@@ -171,7 +170,7 @@ def _cumulative(figure: Plot, trajectory: DrawnTrajectory, values: Floats, least
 
 def _some(count: int) -> NDArray[np.int64]:
     """Rows, out of ``count``, that a line is drawn through, including the first and the last."""
-    return np.linspace(0, count - 1, min(count, _MAX_POINTS)).astype(np.int64)
+    return np.linspace(0, count - 1, min(count, MAX_POINTS)).astype(np.int64)
 
 
 def window(count: int) -> int:
