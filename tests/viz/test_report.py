@@ -300,8 +300,8 @@ def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
     points[:30, 0] = 130.0  # a gable far away
     points[30:40] = [[9000.0, -3000.0, 50.0]] * 10
     low, high = surroundings(np.array([[-1.0, -1.0, 0.0], [30.0, 1.0, 0.1]]), [points])
-    assert (low > [-96.0, -22.0, -3.0]).all() and (low < [-89.9, -19.9, -1.9]).all()
-    assert (high > [129.9, 19.9, 7.9]).all() and (high < [136.0, 22.0, 9.0]).all()
+    assert (low > [-102.0, -22.5, -3.0]).all() and (low < [-89.9, -19.9, -1.9]).all()
+    assert (high > [129.9, 19.9, 7.9]).all() and (high < [142.0, 22.5, 9.0]).all()
 
 
 def test_a_verdict_in_a_column_of_text_stands_where_the_text_of_the_others_does(tmp_path):
