@@ -122,10 +122,8 @@ class Ending:
     @property
     def how(self) -> str:
         """End state of a process that did not end by itself: out of memory, timed out, not run or crashed."""
-        by_system = (
-            self.killed_for is KilledFor.NOTHING and self.code == -signal.SIGKILL
-        )  # as the system does when memory runs out
-        return KilledFor.MEMORY.value if by_system else self.killed_for.value
+        is_killed = self.killed_for is KilledFor.NOTHING and self.code == -signal.SIGKILL  # for want of memory
+        return KilledFor.MEMORY.value if is_killed else self.killed_for.value
 
     def reason(self, limits: Limits, output: str) -> str:
         """The limit that it was killed for, else signal or exit code with the last of its output."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,42 +13,19 @@ from scanchain.data import RawPoints
 
 _SCANS, _EVERY = 30, 3  # number of the first scans, of which every third is measured
 _PATCHES = 300  # of a scan, evenly spread
-
-
-class NoiseFit(NamedTuple):
-    """How the noise is estimated from variances of patches, and what of it is reported.
-
-    freedom : points of a patch beyond the parameters of its plane
-    within, share_within : noise variances up to which a patch is planar; share of planar ones below that
-    median_within, fifth : of χ² of 4 degrees of freedom over 4, the median below ``within``, the first
-        quintile
-    planar : least share of planar patches at a range for its noise to be known
-    fewest : least number of patches at a range
-    clutter, clutter_m : share of the range and meters, above both of which a mode is clutter
-    least_m : smallest standard deviation reported: ranges may be rounded to one number
-    varies : ratio of the standard deviations at two ranges above which the noise is reported by range
-    known : least share of the patches at ranges whose noise is known
-    """
-
-    freedom: int = 4
-    within: float = 3.0
-    share_within: float = 0.9826
-    median_within: float = 0.8216
-    fifth: float = 0.4122
-    planar: float = 0.5
-    fewest: int = 60
-    clutter: float = 0.05
-    clutter_m: float = 0.1
-    least_m: float = 1e-4
-    varies: float = 2.0
-    known: float = 0.3
-
-
-_FIT = NoiseFit()
-_NEAREST_M = 0.05  # ranges below it are of the lidar itself
+_FREEDOM = 4  # points of a patch beyond the parameters of its plane
+_MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: median below _WITHIN, first quintile
+_WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # a patch is planar up to this many noise variances; share below that
+_PLANAR = 0.5  # least share of planar patches at a range for its noise to be known
+_FEWEST = 60  # least number of patches at a range
+_CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is clutter
+_LEAST_M = 1e-4  # smallest standard deviation reported: ranges may be rounded to one number
+_VARIES = 2.0  # ratio of the standard deviations at two ranges above which the noise is reported by range
+_KNOWN = 0.3  # least share of the patches at ranges whose noise is known
+_NEAREST_M = 0.05
 _SECTORS, _SECTOR_POINTS = 16, 8000  # a large first cloud: only parts of 16 sectors are searched for neighbors
-_WEDGES = 4  # later clouds: of the points and patches of the first one, a quarter each, about another azimuth
-_GOLDEN = 0.618034  # golden ratio: share of the points of a cloud between the middles of successive wedges
+_WEDGE_POINTS, _WEDGE_PATCHES = 2000, 75  # later clouds: one wedge each, about another azimuth
+_GOLDEN = 0.618034  # share of the cloud's points between the middles of successive wedges
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +56,7 @@ class RangeNoise:
             return replace(self, scans=self.scans + 1)
         if self.scans and points.shape[1] == 3 and len(points) > _SECTOR_POINTS:
             ranges_m, variances_m2 = _patches(
-                _wedge(points, int(_GOLDEN * self.scans % 1.0 * len(points))), _PATCHES // _WEDGES
+                _wedge(points, int(_GOLDEN * self.scans % 1.0 * len(points))), _WEDGE_PATCHES
             )
         else:
             ranges_m, variances_m2 = _patches(points, _PATCHES)
@@ -97,7 +73,7 @@ class RangeNoise:
         sigmas_m = [sigma_m for _, sigma_m, _ in self.by_range]
         if not self.sigma_m:
             return "unknown: too few surfaces whose beams lie next to each other"
-        if not sigmas_m or max(sigmas_m) < _FIT.varies * min(sigmas_m):
+        if not sigmas_m or max(sigmas_m) < _VARIES * min(sigmas_m):
             return f"{100.0 * self.sigma_m:.2g} cm of a range"
         known = ", ".join(f"{100.0 * sigma_m:.2g} cm at {range_m:.2g} m" for range_m, sigma_m, _ in self.by_range)
         return f"{100.0 * self.sigma_m:.2g} cm of a typical range: {known}"
@@ -121,23 +97,22 @@ def _typical_m(
     variances_m2: NDArray[np.float64],
 ) -> float:
     _, sigmas_m, counts = np.array(by_range).reshape(-1, 3).T
-    if counts.sum() > _FIT.known * len(ranges_m):
+    if counts.sum() > _KNOWN * len(ranges_m):
         return float(np.exp(np.average(np.log(sigmas_m), weights=counts)))
     return _sigma_m(variances_m2, float(np.median(ranges_m))) if len(ranges_m) else 0.0
 
 
 def _wedge(points: RawPoints, middle: int) -> RawPoints:
-    """Points of a cloud (N, 3) in a wedge about the azimuth of one, of that many points without gaps."""
+    """Points of a cloud (N, 3) in a wedge about the azimuth of one, sized for _WEDGE_POINTS without gaps."""
     x, y = points[:, 0], points[:, 1]
     across = np.abs(x[middle] * y - y[middle] * x)
-    half_rad = math.pi * (_SECTOR_POINTS // _WEDGES) / len(points)
-    return points[across < math.tan(half_rad) * (x[middle] * x + y[middle] * y)]
+    return points[across < math.tan(math.pi * _WEDGE_POINTS / len(points)) * (x[middle] * x + y[middle] * y)]
 
 
 def _patches(points: RawPoints, most: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Median range and variance of ranges (P,) of at most ``most`` patches of a scan (N, d)."""
     d = points.shape[1]
-    size = d + _FIT.freedom
+    size = d + _FREEDOM
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     if (share := _SECTOR_POINTS / max(len(points), 1)) < 1.0:
         sector = azimuth * (_SECTORS / (2.0 * math.pi))
@@ -163,22 +138,22 @@ def _patches(points: RawPoints, most: int) -> tuple[NDArray[np.float64], NDArray
     q, _ = np.linalg.qr(directions[patches] * weight[..., None])
     y = weight / of_patch_m
     residual = y - (q @ (np.swapaxes(q, 1, 2) @ y[..., None]))[..., 0]
-    return median_m, median_m**4 * (residual**2).sum(axis=1) / _FIT.freedom
+    return median_m, median_m**4 * (residual**2).sum(axis=1) / _FREEDOM
 
 
 def _sigma_m(variances: NDArray[np.float64], range_m: float) -> float:
     """Standard deviation of the lowest mode of variances (P,) at that range; 0 where it is unknown."""
-    if len(variances) < _FIT.fewest:
+    if len(variances) < _FEWEST:
         return 0.0
     variances = np.sort(variances)
-    variance = float(variances[len(variances) // 5]) / _FIT.fifth
+    variance = float(variances[len(variances) // 5]) / _FIFTH
     for _ in range(30):
-        before, count = variance, int(np.searchsorted(variances, _FIT.within * variance, side="right"))
+        before, count = variance, int(np.searchsorted(variances, _WITHIN * variance, side="right"))
         if count:
-            variance = 0.5 * float(variances[(count - 1) // 2] + variances[count // 2]) / _FIT.median_within
+            variance = 0.5 * float(variances[(count - 1) // 2] + variances[count // 2]) / _MEDIAN_WITHIN
         if abs(variance - before) <= 1e-3 * before:
             break
-    planar = np.searchsorted(variances, _FIT.within * variance, side="right") / len(variances) / _FIT.share_within
+    planar = np.searchsorted(variances, _WITHIN * variance, side="right") / len(variances) / _SHARE_WITHIN
     sigma_m = math.sqrt(variance)
-    is_clutter = planar < _FIT.planar or sigma_m > max(_FIT.clutter * range_m, _FIT.clutter_m)
-    return 0.0 if is_clutter else max(sigma_m, _FIT.least_m)
+    is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
+    return 0.0 if is_clutter else max(sigma_m, _LEAST_M)

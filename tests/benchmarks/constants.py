@@ -313,7 +313,7 @@ CASES: dict[str, Case] = {
     "mocap": of_log("2d/mocap_room_1.bag", 150),
     "lost in a building": of_log("2d/mit_csail.mcap", 300, range(60, 120), odometry__prior="constant-velocity"),
     "standing in a room": of_log("reports/rplidar_standing.bag", 100),
-    "kitti": of_log("3d/kitti_0005_first60.mcap", 12),
+    "kitti": of_log("3d/kitti_0005_first60.mcap", 20),
     "svd-icp": of_log("3d/kitti_0001_first54.mcap", 8, matching__matcher="svd"),
     "pandaset": of_log("3d/pandaset_002_sweeps30to55.mcap", 8, topic="/pandar64/points"),
     "standing in a street": of_standing,

@@ -25,35 +25,15 @@ from scanchain.logs.messages.readers import is_scan
 from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
-
-class Thresholds(NamedTuple):
-    """Limits of what is reported of a log.
-
-    gap_periods : longest time between scans, in periods, that is not a gap
-    long_gap_s, long_gap_on_wheels_s : longest gap over which the motion is predicted reliably
-    part_of_scan, more_than_scan : scan duration over period outside which a time unit is implausible
-    fastest_m_s : speed from wheel odometry above which its unit is implausible
-    least_step_m : distance between two wheel readings above which the robot moves
-    many_unused : share of unused returns above which a wider range is recommended
-    stuck_share : share of beams at the farthest range above which it is reported
-    few_points : number of returns below which matches are weak
-    same_m : largest difference of ranges that count as equal: rounding of float32
-    """
-
-    gap_periods: float = 2.5
-    long_gap_s: float = 0.5
-    long_gap_on_wheels_s: float = 10.0
-    part_of_scan: float = 0.3
-    more_than_scan: float = 1.2
-    fastest_m_s: float = 100.0
-    least_step_m: float = 1e-3
-    many_unused: float = 0.3
-    stuck_share: float = 0.01
-    few_points: int = 50
-    same_m: float = 1e-4
-
-
-_LIMITS = Thresholds()
+_GAP_PERIODS = 2.5  # longest time between scans, in periods, that is not a gap
+_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0  # longest gap over which the motion is predicted reliably
+_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # scan duration over period outside which a time unit is implausible
+_FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
+_LEAST_STEP_M = 1e-3  # distance between two wheel readings above which the robot moves
+_MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
+_STUCK_SHARE = 0.01  # share of beams at the farthest range above which it is reported
+_FEW_POINTS = 50  # number of returns below which matches are weak
+_SAME_M = 1e-4  # largest difference of ranges that count as equal: rounding of float32
 
 
 class Severity(StrEnum):
@@ -149,7 +129,7 @@ class Survey:
         if scan.T_odom_base is not None:
             self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
         ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
-        at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - _LIMITS.same_m))
+        at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M))
         percentiles_m = ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)]
         span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan
         counts, farthest_m = (len(ranges_m), scan.dropped), round(float(ranges_m[-1]), 4)
@@ -190,17 +170,15 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
 
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     steps_s = np.diff(seen.log_times_ns) * 1e-9
-    gaps = (
-        np.flatnonzero(steps_s > _LIMITS.gap_periods * seen.period_s) if seen.period_s else np.empty(0, np.int64)
-    )
-    periods = f"{_LIMITS.gap_periods:g} periods" + (f" of {seen.period_s:.3g} s" if seen.period_s else "")
+    gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
+    periods = f"{_GAP_PERIODS:g} periods" + (f" of {seen.period_s:.3g} s" if seen.period_s else "")
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {periods}")
     longest = int(gaps[np.argmax(steps_s[gaps])])
     longest_s, at_s = steps_s[longest], seen.log_time_s(longest)
     found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, {at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
-    if longest_s < (_LIMITS.long_gap_on_wheels_s if is_on_wheels else _LIMITS.long_gap_s):
+    if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
         return Finding("gaps", Severity.NOTE, found, effect)
     effect += (
         "; after a long gap a match may converge to a wrong pose: run the part before, as below, and the rest, "
@@ -234,7 +212,7 @@ def _wheels(seen: Survey) -> Finding:
     missed = len(seen.scans) - len(seen.wheels)
     found = f"{log.wheels}: {missed} of {scans} without a reading within 0.5 s"
     without = "--odometry.prior constant-velocity"
-    if (speed_m_s := _wheel_speed_m_s(seen)) > _LIMITS.fastest_m_s:
+    if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
         effect = "no vehicle is as fast: millimeters, or jumps? Poses are predicted far from the robot"
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
@@ -253,7 +231,7 @@ def _wheel_speed_m_s(seen: Survey) -> float:
     stamps_ns, order = np.unique([stamp_ns for stamp_ns, _ in seen.wheels], return_index=True)
     positions = np.array([seen.wheels[k][1] for k in order])
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    moving = steps_m > _LIMITS.least_step_m
+    moving = steps_m > _LEAST_STEP_M
     return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
 
 
@@ -270,7 +248,7 @@ def _point_times(seen: Survey) -> Finding:
     assumed = times.assumed.removeprefix("point times").lstrip(": ") or "time_increment of the beams"
     found = f"{assumed}; a scan lasts {1e3 * span_s:.4g} ms"
     part = span_s / seen.period_s if seen.period_s else 1.0
-    if is_scan(seen.log.lidar) or _LIMITS.part_of_scan < part < _LIMITS.more_than_scan:
+    if is_scan(seen.log.lidar) or _PART_OF_SCAN < part < _MORE_THAN_SCAN:
         grade = Severity.WARNING if untimed else Severity.NOTE if faults else Severity.OK
         effect = f"{counted(untimed, 'scan')} without: {distorted}" if untimed else "the rest is used"
         return Finding("point times", grade, "; ".join([found, *faults]), effect if faults else "")
@@ -288,9 +266,9 @@ def _other_unit(assumed: str, part: float) -> str:
     if not current:
         return ""
     for unit, unit_s in UNITS_S.items():
-        if unit != current and _LIMITS.part_of_scan < part * unit_s / UNITS_S[current] < _LIMITS.more_than_scan:
+        if unit != current and _PART_OF_SCAN < part * unit_s / UNITS_S[current] < _MORE_THAN_SCAN:
             return f"--log.point_times {unit}"
-    return "--log.point_times none" if part > _LIMITS.more_than_scan else ""
+    return "--log.point_times none" if part > _MORE_THAN_SCAN else ""
 
 
 def _damage(seen: Survey, preprocess: PreprocessConfig, most_bad: float) -> Finding:
@@ -316,11 +294,9 @@ def _returns(seen: Survey) -> Finding:
     lost = float(invalid.sum() / max((valid + invalid).sum(), 1))
     usual = f"{int(np.median(valid)):,} valid per scan (median)"
     found = f"{100 * lost:.2g} % of the beams without a valid return, {usual}"
-    poor = valid < _LIMITS.few_points
+    poor = valid < _FEW_POINTS
     if few := int(np.count_nonzero(poor)):
-        effect = (
-            f"{counted(few, 'scan')} with fewer than {_LIMITS.few_points} returns: matches are weak or lost there"
-        )
+        effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak or lost there"
         return Finding("returns", Severity.WARNING, found, effect, _without_ends(seen, poor))
     return Finding("returns", Severity.OK, found)
 
@@ -350,7 +326,7 @@ def _no_return(seen: Survey) -> Finding:
     farthest_m = max(values)
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.valid + scan.invalid for scan in seen.scans), 1)
-    if share < _LIMITS.stuck_share:
+    if share < _STUCK_SHARE:
         return Finding("no return", Severity.OK, "no range is so frequent that it would indicate no return")
     found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest range"
     effect = "if it indicates no return, it is matched like a wall that moves along"
@@ -368,12 +344,12 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
         effect = f"{100 * unused:.3g} % lie beyond {high_m:g} m and are not used"
         if low_m <= 1e-3 * float(np.median(ranges_m)) <= high_m < near_m:
             return Finding("ranges", Severity.PROBLEM, found, f"{effect}: millimeters? convert them to meters")
-        fix = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _LIMITS.many_unused else ""
+        fix = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
         return Finding("ranges", Severity.NOTE, found, effect, fix)
     if near_m < low_m:
         unused = float(np.mean(ranges_m < low_m))
         effect = f"{100 * unused:.3g} % lie nearer than {low_m:g} m and are not used (right for the robot itself)"
-        fix = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _LIMITS.many_unused else ""
+        fix = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
         return Finding("ranges", Severity.NOTE, found, effect, fix)
     return Finding("ranges", Severity.OK, found)
 

@@ -15,36 +15,18 @@ from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 
 # limits chosen with the lidars of tests/logs/test_sectors.py
-
-
-class SectorLimits(NamedTuple):
-    """What a lidar that publishes a revolution in sectors is recognized by.
-
-    sample : number of evenly spaced points of a message that determine its direction and width
-    fewest : number of messages after which a lidar that always faces one direction is recognized
-    revolutions : smallest number of revolutions in the sample
-    widths : limits of a sector's width over the angle to the next
-    regular : smallest share of messages at the usual angle to the next; others are lost or blind sectors
-    slowest_s : longest revolution of a lidar; a slower rotation may be the robot's
-    same : share of a sector by which directions may differ that count as equal
-    missing : length of a gap, in revolutions, above which it ends the sweep
-    """
-
-    sample: int = 250
-    fewest: int = 3
-    revolutions: float = 2.0
-    widths: tuple[float, float] = (0.5, 1.5)
-    regular: float = 0.6
-    slowest_s: float = 1.5
-    same: float = 0.1
-    missing: float = 0.75
-
-
-_LIMITS = SectorLimits()
+_SAMPLE = 250  # number of evenly spaced points of a message that determine its direction and width
 _TURN_RAD = 2.0 * np.pi
 _WIDEST_RAD = 4.0 / 3.0 * np.pi  # angular width of a message above which it is a sweep by itself
+_FEWEST = 3  # number of messages after which a lidar that always faces one direction is recognized
 MOST = 1000  # largest number of messages sampled; usually fewer suffice
+_REVOLUTIONS = 2.0  # smallest number of revolutions in the sample
+_WIDTHS = (0.5, 1.5)  # limits of a sector's width over the angle to the next
+_REGULAR = 0.6  # smallest share of messages at the usual angle to the next; others are lost or blind sectors
+_SLOWEST_S = 1.5  # longest revolution of a lidar; a slower rotation may be the robot's
 _CLEAR_RAD = 2.0 / 3.0 * np.pi  # largest angle between messages that shows the sense of rotation
+_SAME = 0.1  # share of a sector by which directions may differ that count as equal
+_MISSING = 0.75  # length of a gap, in revolutions, above which it ends the sweep
 
 
 class Sectors(NamedTuple):
@@ -89,15 +71,13 @@ def find_sectors(sample: Iterable[Returns], point_times: str) -> Sectors | None:
             continue
         seen.append(returns)
         directions_rad.append(_direction(points))
-        turned_rad = _wrapped(_azimuth(points[:: len(points) // _LIMITS.sample + 1]) - directions_rad[-1])
+        turned_rad = _wrapped(_azimuth(points[:: len(points) // _SAMPLE + 1]) - directions_rad[-1])
         widths_rad.append(float(np.ptp(np.percentile(turned_rad, (5.0, 95.0)))) / 0.9)
         steps_rad = np.abs(_wrapped(np.diff(directions_rad)))
-        is_one_way = len(seen) == _LIMITS.fewest and np.median(widths_rad) > _LIMITS.widths[1] * np.median(
-            steps_rad
-        )
+        is_one_way = len(seen) == _FEWEST and np.median(widths_rad) > _WIDTHS[1] * np.median(steps_rad)
         if widths_rad[-1] > _WIDEST_RAD or returns.frame != seen[0].frame or is_one_way:
             return None
-        if steps_rad.sum() > (_LIMITS.revolutions + 1.0) * _TURN_RAD or len(seen) == MOST:
+        if steps_rad.sum() > (_REVOLUTIONS + 1.0) * _TURN_RAD or len(seen) == MOST:
             break
     found = _sectors(seen, np.array(directions_rad), float(np.median(widths_rad))) if len(seen) > 2 else None
     return found and _timed(found, seen, point_times)
@@ -114,11 +94,8 @@ def _sectors(seen: Sequence[Returns], directions_rad: NDArray[np.float64], width
     turned_rad = np.append(0.0, np.cumsum(steps_rad))
     is_usual = np.abs(_wrapped(steps_rad - step_rad)) <= 0.5 * step_rad
     step_rad = float(steps_rad[is_usual].mean())
-    is_sector = (
-        _LIMITS.widths[0] * step_rad <= width_rad <= _LIMITS.widths[1] * step_rad
-        and np.mean(is_usual) >= _LIMITS.regular
-    )
-    if not is_sector or turned_rad[-1] + 1.5 * step_rad < _LIMITS.revolutions * _TURN_RAD:
+    is_sector = _WIDTHS[0] * step_rad <= width_rad <= _WIDTHS[1] * step_rad and np.mean(is_usual) >= _REGULAR
+    if not is_sector or turned_rad[-1] + 1.5 * step_rad < _REVOLUTIONS * _TURN_RAD:
         return None
     first = np.flatnonzero(turned_rad + _TURN_RAD < turned_rad[-1] + 0.5 * step_rad)
     later = np.abs(turned_rad[:, None] - turned_rad[first] - _TURN_RAD).argmin(axis=0)
@@ -126,10 +103,10 @@ def _sectors(seen: Sequence[Returns], directions_rad: NDArray[np.float64], width
     stamps_ns = np.array([each.stamp_ns for each in seen])
     seconds = 1e-9 * (stamps_ns[later] - stamps_ns[first])
     period_s = float(np.median(seconds * _TURN_RAD / (_TURN_RAD + drift_rad)))
-    if not 0.0 < period_s < _LIMITS.slowest_s:
+    if not 0.0 < period_s < _SLOWEST_S:
         return None
     per_sweep = float(_TURN_RAD / np.mean(steps_rad))
-    if np.median(np.abs(drift_rad)) < _LIMITS.same * step_rad:  # the same sectors recur: a whole number of them
+    if np.median(np.abs(drift_rad)) < _SAME * step_rad:  # the same sectors recur: a whole number of them
         per_sweep = float(np.max(later - first))
     return Sectors(sense, step_rad, per_sweep, period_s)
 
@@ -216,7 +193,7 @@ class Assembler:
         turned_rad = sectors.sense * (direction_rad - last.direction_rad)
         turned_rad = (turned_rad + self.half_rad) % _TURN_RAD - self.half_rad
         revolutions = 1e-9 * (returns.stamp_ns - last.returns.stamp_ns) / sectors.period_s
-        is_apart = not -0.5 < revolutions < turned_rad / _TURN_RAD + _LIMITS.missing
+        is_apart = not -0.5 < revolutions < turned_rad / _TURN_RAD + _MISSING
         return (part if is_apart else part._replace(angle_rad=last.angle_rad + turned_rad)), is_apart
 
     def _complete(self, parts: list[_Part]) -> Iterator[Decoded]:
@@ -225,7 +202,7 @@ class Assembler:
             return
         first, last, returns = parts[0], parts[-1], [part.returns for part in parts]
         begin_rad = 0.0 if self.is_split else first.angle_rad - self.half_rad
-        if last.angle_rad + self.half_rad - begin_rad < 0.5 * _TURN_RAD - _LIMITS.same * self.half_rad:
+        if last.angle_rad + self.half_rad - begin_rad < 0.5 * _TURN_RAD - _SAME * self.half_rad:
             self.incomplete += 1
             return
         begin_s = self.rate * (begin_rad - (first.angle_rad - self.half_rad))  # relative to the stamp of the first
@@ -268,7 +245,7 @@ def _azimuth(points: RawPoints) -> NDArray[np.float32]:
 
 def _direction(points: RawPoints) -> float:
     """Mean azimuth of points (N, d), from a sample of them."""
-    x, y = points[:: len(points) // _LIMITS.sample + 1, :2].T
+    x, y = points[:: len(points) // _SAMPLE + 1, :2].T
     ranges_m = np.maximum(np.hypot(x, y), np.finfo(np.float32).tiny)
     return float(np.arctan2((y / ranges_m).sum(), (x / ranges_m).sum()))
 

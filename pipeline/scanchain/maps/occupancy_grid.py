@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,22 +14,13 @@ from scanchain.errors import InputError
 from scanchain.kernels import maps as kernels
 
 OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
-FREE_PROBABILITY = 1.0 - OCCUPIED_PROBABILITY  # below it as free; in between, or unseen, as unknown
+FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown
 MAX_CELLS = 64_000_000  # largest number of cells: half a gigabyte
 
-
-class LogOdds(NamedTuple):
-    """Log-odds of an observation, 0.7 and 0.4, and their limits, 0.12 and 0.97 (Hornung et al. 2013, 5.1)."""
-
-    hit: float = 0.85
-    miss: float = -0.4
-    low: float = -2.0
-    high: float = 3.5
-
-
-MODEL = LogOdds()
+_HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, sec. 5.1
+_LOW, _HIGH = -2.0, 3.5
 _MARGIN = 2  # cells around all beams; rounding may shift a beam by one cell
-_FINITE = float(np.finfo(np.float64).max)  # m², largest squared range
+_LARGEST = 1e300  # m², of squared ranges
 _GROWTH = 0.25  # share of the extent that is added where the grid has to grow
 
 
@@ -71,8 +61,8 @@ class OccupancyGrid:
             corners = [(each.min(axis=0), each.max(axis=0)) for each in (starts, ends)]
             self._cover(np.concatenate([np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))]))
             kernels.draw_beams(
-                starts, ends, kept, self.origin_m, self.resolution_m, self.scans + 1, np.float32(MODEL.hit),
-                np.float32(MODEL.miss), np.float32(MODEL.low), np.float32(MODEL.high), self.log_odds, self.drawn,
+                starts, ends, kept, self.origin_m, self.resolution_m, self.scans + 1, np.float32(_HIT),
+                np.float32(_MISS), np.float32(_LOW), np.float32(_HIGH), self.log_odds, self.drawn,
             )  # fmt: skip
         self.scans += len(poses)
 
@@ -83,7 +73,7 @@ class OccupancyGrid:
         the lidar's height, it starts where it enters the slice: at the share limit / z of its length.
         """
         squares = sum(column * column for column in points.T)
-        points = points[squares <= min(self.config.grid_max_range_m**2, _FINITE)]
+        points = points[squares <= min(self.config.grid_max_range_m**2, _LARGEST)]
         moved = np.asarray(sum(T[:-1, axis] * points[:, axis, None] for axis in range(points.shape[1])))
         share = 0.0
         if points.shape[1] == 3:

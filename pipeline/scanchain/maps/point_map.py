@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,29 +19,14 @@ from scanchain.kernels.voxels import EMPTY
 from scanchain.threads import threads
 
 MAX_VOXELS = 16_000_000  # largest number of voxels: a gigabyte
-_FIRST_VOXELS = 1 << 14  # number of voxels that memory is first taken for
+_FIRST_VOXELS = 1 << 14
 
-
-class RangeImage(NamedTuple):
-    """Comparison of points of a map with the range image of a scan.
-
-    columns : bins of azimuth, 0.5°; as fine in elevation
-    reach_bins : width of a bin in voxels at the farthest range that a scan is used to
-    window : share of a scan's spacing, within which a surface has a point
-    margin_share : share of a range by which two may differ, plus one voxel
-    level_voxels, level_share : assumed flatness of the ground in voxels, error of an elevation
-    """
-
-    columns: int = 720
-    reach_bins: float = 1.5
-    window: float = 0.6
-    margin_share: float = 0.03
-    level_voxels: float = 0.5
-    level_share: float = 0.005
-
-
-_IMAGE = RangeImage()
+_COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
+_REACH_BINS = 1.5  # width of a bin in voxels at the farthest range that a scan is used to
 _CUBES_TO_REACH = 8.0  # number of cubes along the reach, by which points are sorted
+_WINDOW = 0.6  # share of a scan's spacing, within which a surface has a point
+_RANGE_MARGIN_SHARE = 0.03  # share of a range by which two may differ, plus one voxel
+_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # assumed flatness of the ground in voxels, error of an elevation
 _LEAST_THROUGH = 2  # least number of scans that saw through what moved
 _MAJORITY = 1.5  # least ratio of scans that saw through to scans that saw a surface there
 _ENOUGH = 12  # number of scans that saw a surface for which it is retained
@@ -152,7 +136,7 @@ def clearly_through(seen: NDArray[np.int32], seen_through: NDArray[np.int32]) ->
 
 def reach_of(voxel_size_m: float) -> float:
     """Range up to which scans are compared with the points of a map of such voxels, meters."""
-    return _IMAGE.reach_bins * voxel_size_m * _IMAGE.columns / (2.0 * np.pi)
+    return _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi)
 
 
 def sightings(
@@ -164,7 +148,7 @@ def sightings(
     """
     index = _Cells(lie.lift_points(voxels), reach_of(voxel_size_m))
     seen, seen_through = np.zeros((2, len(voxels)), np.int32)
-    ranges_m = np.empty((1 if voxels.shape[1] == 2 else _IMAGE.columns // 2, _IMAGE.columns))
+    ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
     count = threads()
     with ThreadPoolExecutor(count) as pool:  # points are independent, and kernels release the GIL
         for view in views:
@@ -172,8 +156,8 @@ def sightings(
             T_world_lidar = lie.lift(view.T_world_lidar)
             T_lidar_world, spans = lie.inverse(T_world_lidar), index.within_reach(T_world_lidar[:3, 3])
             limits = np.array([
-                index.reach_m, max(_IMAGE.window * view.spacing_m, voxel_size_m), voxel_size_m,
-                _IMAGE.margin_share, _IMAGE.level_voxels * voxel_size_m, _IMAGE.level_share,
+                index.reach_m, max(_WINDOW * view.spacing_m, voxel_size_m), voxel_size_m, _RANGE_MARGIN_SHARE,
+                _LEVEL_VOXELS * voxel_size_m, _LEVEL_SHARE,
             ])  # fmt: skip
             parts = [
                 pool.submit(

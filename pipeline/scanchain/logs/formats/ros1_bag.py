@@ -47,7 +47,7 @@ _TIME = struct.Struct("<II")  # seconds, nanoseconds
 _COUNT = struct.Struct("<II")  # connection, number of its messages
 _ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
 _LONGEST_HEAD = 1 << 16  # bytes; a longer head of a record is damage
-_FIELDS = {  # a field that identifies each type of record; "count" is checked last
+_FIELDS: dict[int, bytes] = {  # a field that identifies each type of record; "count" is checked last
     Op.MESSAGE: b"time", Op.HEADER: b"index_pos", Op.CHUNK: b"compression", Op.CHUNK_INFO: b"chunk_pos",
     Op.CONNECTION: b"topic", Op.INDEX: b"count",
 }  # fmt: skip

@@ -23,7 +23,7 @@ NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
 _NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
-UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # seconds of each unit of log.point_times
+UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO, _AT_ONCE = "no point times", "every scan counts as measured at once"
 UNTIMED = f"{_NO}: {_AT_ONCE}"
 _STAMP, _EPOCH, _CLOCK = "after the stamp", "since the epoch", "of another clock, counted from the first point"
@@ -32,39 +32,18 @@ _SHORTEST_SCAN_NS = 500_000  # shortest span of a scan: integers with a smaller 
 _LONGEST_SCAN = 1e4  # longest span in milliseconds: floats with a larger one are micro- or nanoseconds
 _NEAR_S = 1.0  # longest time between the stamp of a scan and its beginning
 _ABSOLUTE_S = 3600.0  # smallest time that can be absolute, as it may also count from the stamp
-
-
-class SpanLimits(NamedTuple):
-    """Shares that decide whether times of points are plausible, and which of them are outliers.
-
-    core : share of correct times assumed in a scan: the span of its densest part is not affected by the
-        others
-    dense : smallest share of the core in the span of a sweep without outliers
-    short, long : limits of a span as a share of the usual span or of the period
-    longest, most_periods : longest sweep without outliers in usual spans, and any sweep in periods
-    step : share of the usual span above which a step back starts a row, or is a reset of the counter
-    part_of_turn : smallest share of the time of a turn that its beams take
-    shortest_part, longest_part : limits of a span as a share of the period: outside, the unit is wrong
-    """
-
-    core: float = 0.7
-    dense: float = 0.85
-    short: float = 0.9
-    long: float = 1.2
-    longest: float = 2.5
-    most_periods: float = 10.0
-    step: float = 0.25
-    part_of_turn: float = 0.6
-    shortest_part: float = 0.005
-    longest_part: float = 2.0
-
-
-_SPAN = SpanLimits()
+_CORE = 0.7  # share of correct times assumed in a scan: the span of its densest part is not affected by the others
 _SAMPLE = np.sort(np.random.default_rng(0).random(512))  # positions, 0 to 1, of the times that are sampled
 
 # comparison with the neighboring scans and the period; chosen with the drivers of tests/logs/test_point_times.py
 _BEFORE, _AFTER = 12, 3  # number of neighbors before and after a scan
+_SHORT, _LONG = 0.9, 1.2  # limits of a span as a share of the usual span or of the period
+_DENSE = 0.85  # smallest share of the core in the span of a sweep without outliers
+_LONGEST, _MOST_PERIODS = 2.5, 10.0  # longest sweep without outliers in usual spans, and any sweep in periods
+_STEP = 0.25  # share of the usual span above which a step back starts a row, or is a reset of the counter
+_PART_OF_TURN = 0.6  # smallest share of the time of a turn that its beams take
 _SPANS = 100  # number of first scans whose spans are compared with the period
+_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # limits of a span as a share of the period: outside, the unit is wrong
 
 _LEFT_OUT = "contradict the others: these points are left out"
 _UNWRAPPED = "step back where a counter wrapped or was reset: repaired"
@@ -205,11 +184,11 @@ class PointTimes:
         if not isfinite(span):
             sample, first = sample[np.isfinite(sample)], values.min(where=np.isfinite(values), initial=np.inf)
             span = inf
-        low, core, many = first, 0.0, int(_SPAN.core * len(sample))
+        low, core, many = first, 0.0, int(_CORE * len(sample))
         if many:
             with np.errstate(over="ignore"):
                 windows = (sample[many:] - sample[: len(sample) - many]).astype(np.float64)
-            begin, core = float(sample[windows.argmin()]), float(windows.min()) / _SPAN.core
+            begin, core = float(sample[windows.argmin()]), float(windows.min()) / _CORE
             core = span if core > span else core  # of few points
             if float(first) < begin - core:
                 low = values.min(where=values >= begin - core, initial=values.max())
@@ -254,7 +233,7 @@ class PointTimes:
     def warnings(self, topic: str) -> list[str]:
         """Warning if by the period the times of sweeps are in another unit."""
         span_s, period_s = (median_low(each[:_SPANS] or [0.0]) for each in (self.spans_s, self.periods_s))
-        if not span_s or not period_s or _SPAN.shortest_part < span_s / period_s < _SPAN.longest_part:
+        if not span_s or not period_s or _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
             return []
         return [
             f"by their point times scans of {topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} of the "
@@ -292,7 +271,7 @@ class PointTimes:
         for unit in [self.unit] if self.unit else UNITS_S:
             whole_s, scan_s = (UNITS_S[unit] * each for each in (all_s, beams.scan_time_s))
             is_by_scan, is_by_period = _fits(whole_s, scan_s, turns), _fits(whole_s, period_s, turns)
-            most_s = min(_SPAN.long * longest_s, _SPAN.most_periods * period_s or inf)
+            most_s = min(_LONG * longest_s, _MOST_PERIODS * period_s or inf)
             if is_by_period or (whole_s <= most_s and (is_by_scan or not period_s)):
                 self.spans_s.append(whole_s)
                 note = f"point times: time_increment taken as {unit} (log.point_times)"
@@ -319,13 +298,13 @@ class PointTimes:
         self.spans_s.append(usual_s)
         self.periods_s.append(period_s)
         seen = f"{field.span * unit_s:.3g} s, usually {usual_s:.3g} s, period {period_s:.3g} s"
-        if usual_s > (_SPAN.most_periods * period_s or LONGEST_SWEEP_S):
+        if usual_s > (_MOST_PERIODS * period_s or LONGEST_SWEEP_S):
             return NO_TIMES, _REFUTED, seen
-        regular = [each for each in fields if _SPAN.short * usual_s <= each.span * unit_s <= _SPAN.long * usual_s]
+        regular = [each for each in fields if _SHORT * usual_s <= each.span * unit_s <= _LONG * usual_s]
         lows_s = [unit_s * float(each.low) for each in regular if each.origin == field.origin == _STAMP]
         low_s = median_low(lows_s or [0.0])
-        if not _SPAN.short * usual_s <= field.span * unit_s <= _SPAN.long * usual_s:
-            usual_back = int(np.count_nonzero(regular[0].steps_back(_SPAN.step * usual_s))) if regular else 0
+        if not _SHORT * usual_s <= field.span * unit_s <= _LONG * usual_s:
+            usual_back = int(np.count_nonzero(regular[0].steps_back(_STEP * usual_s))) if regular else 0
             return *_repaired(field, times_s, usual_s, low_s, usual_back), seen
         if lows_s and abs(off_s := unit_s * float(field.low) - low_s) > 0.5 * usual_s:
             return NO_TIMES, _REFUTED, f"begins {off_s:+.3g} s from there"
@@ -365,14 +344,14 @@ def _steps_s(around: Sequence[Returns]) -> list[float]:
 
 def _fits(whole_s: float, turn_s: float, turns: float) -> bool:
     """True if beams that cover ``turns`` turns of ``turn_s`` each can take ``whole_s``."""
-    return _SPAN.part_of_turn * turns * turn_s <= whole_s <= _SPAN.long * turn_s < inf
+    return _PART_OF_TURN * turns * turn_s <= whole_s <= _LONG * turn_s < inf
 
 
 def _usual_span_s(fields: Sequence[Field], unit_s: float, period_s: float) -> float:
     """Usual duration of sweeps: their span, or that of most points if the period contradicts the span."""
     span_s = unit_s * median_low([each.span for each in fields])
     core_s = unit_s * median_low([each.core for each in fields])
-    is_confirmed = core_s >= _SPAN.dense * span_s or span_s <= (_SPAN.long * period_s or 3.0 * core_s)
+    is_confirmed = core_s >= _DENSE * span_s or span_s <= (_LONG * period_s or 3.0 * core_s)
     return span_s if is_confirmed else max(period_s, core_s)
 
 
@@ -384,17 +363,17 @@ def _repaired(
     low_s : usual time of the first point; usual_back : usual number of steps back, 0 in the order of firing
     """
     unit_s, span_s = UNITS_S[field.unit], field.span * UNITS_S[field.unit]
-    steps = field.steps_back(_SPAN.step * usual_s)
+    steps = field.steps_back(_STEP * usual_s)
     if isfinite(span_s) and steps.any() and not usual_back:
         values = field.values - np.append(0, np.cumsum(steps))
         whole_s = unit_s * float(np.ptp(values))
-        if _SPAN.short * usual_s <= whole_s <= _SPAN.long * usual_s:
+        if _SHORT * usual_s <= whole_s <= _LONG * usual_s:
             return (low_s + unit_s * (values - values.min())).astype(np.float32), _UNWRAPPED
     if span_s < usual_s and np.count_nonzero(steps) > 1.5 * usual_back:  # reset, in each row or once
         return NO_TIMES, _REFUTED
-    if span_s < usual_s or (span_s <= _SPAN.longest * usual_s and field.core * unit_s >= _SPAN.dense * span_s):
+    if span_s < usual_s or (span_s <= _LONGEST * usual_s and field.core * unit_s >= _DENSE * span_s):
         return times_s, ""
-    order, most_s = np.sort(times_s[np.isfinite(times_s)]).astype(np.float64), _SPAN.long * usual_s
+    order, most_s = np.sort(times_s[np.isfinite(times_s)]).astype(np.float64), _LONG * usual_s
     begin_s = order[np.argmax(np.searchsorted(order, order + most_s, "right") - np.arange(len(order)))]
     is_right = (times_s >= begin_s) & (times_s <= begin_s + most_s)
     if 2 * np.count_nonzero(is_right) <= len(is_right):
