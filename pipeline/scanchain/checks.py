@@ -21,6 +21,7 @@ from scanchain.errors import InputError, one_line, shown
 from scanchain.kernels.geometry import largest_magnitude, rigidity_error
 from scanchain.kernels.voxels import REACH
 
+_LARGEST_WHOLE = np.iinfo(np.int64).max
 RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _LARGEST_VOXEL = float(1 << 31)  # the index of a voxel along an axis has 32 bits
 _LATEST_S = 1e11  # latest stamp, seconds: the year 5138
@@ -178,7 +179,7 @@ def integer(value: object, name: str, wanted: str, *, least: int | None = None) 
         whole = None
     if whole is None or isinstance(value, bool) or (least is not None and whole < least):
         raise InputError(f"{name} is {shown(value)}; wanted {wanted}")
-    if abs(whole) > np.iinfo(np.int64).max:
+    if abs(whole) > _LARGEST_WHOLE:
         raise InputError(f"{name} is {shown(value)}, too large for 64 bits; wanted {wanted}")
     return whole
 

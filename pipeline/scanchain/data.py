@@ -78,6 +78,8 @@ class RaySpan(NamedTuple):
     @staticmethod
     def among(spans: tuple[RaySpan, ...], chosen: NDArray[np.integer]) -> tuple[RaySpan, ...]:
         """The spans of chosen points, whose numbers (M,) ascend."""
+        if not spans:
+            return spans
         ends = np.searchsorted(chosen, np.cumsum([span.rays for span in spans]))
         rays = np.diff(ends, prepend=0).tolist()
         return tuple(RaySpan(span.origin, count) for span, count in zip(spans, rays, strict=True))

@@ -28,18 +28,24 @@ class GrowingArray:
 
     def append(self, row: Any) -> int:
         """Index of the row, which is appended."""
-        self.extend(np.asarray(row, self._room.dtype)[None])
+        if self._count == len(self._room):
+            self._make_room(self._count + 1)
+        self._room[self._count] = row
+        self._count += 1
         return self._count - 1
 
     def extend(self, rows: NDArray[Any]) -> None:
         """Append rows (n, ...)."""
         end = self._count + len(rows)
         if end > len(self._room):
-            room = np.empty((max(2 * len(self._room), end), *self._room.shape[1:]), self._room.dtype)
-            room[: self._count] = self._room[: self._count]
-            self._room = room
+            self._make_room(end)
         self._room[self._count : end] = rows
         self._count = end
+
+    def _make_room(self, count: int) -> None:
+        room = np.empty((max(2 * len(self._room), count), *self._room.shape[1:]), self._room.dtype)
+        room[: self._count] = self._room[: self._count]
+        self._room = room
 
     @property
     def rows(self) -> NDArray[Any]:

@@ -68,6 +68,7 @@ class PoseGraph:
         self._edges, self._measurements = GrowingArray((2,), np.int64), GrowingArray(pose, np.float64)
         self._information, self._kind = GrowingArray((k, k), np.float64), GrowingArray((), np.int64)
         self._factors: list[Factor] = list(FACTORS)
+        self._counts: set[tuple[int, int]] = set()  # of residuals, that factors of a kind have been seen to return
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._of_edges = (
@@ -158,7 +159,7 @@ class PoseGraph:
     @property
     def is_loop(self) -> Mask:
         """True for every loop edge, (E,)."""
-        return np.isin(self._kind.rows, LOOPS)
+        return (self._kind.rows[:, None] == LOOPS).any(axis=1)
 
     @property
     def is_odometry(self) -> Mask:
@@ -241,14 +242,16 @@ class PoseGraph:
         whole = of_residuals(information, self.freedom, factor)
         edge = np.array([pair], np.int64), Z[None], whole[None]
         check_edges(*edge, len(self), with_origin=True)
-        T_i, T_j = self.poses[[i, j]]  # copies
-        factor.check(T_j if i == ORIGIN else lie.between(T_i, T_j), Z, len(np.asarray(information)))
         known = (
             kind
             for kind, each in enumerate(self._factors)
             if each is factor or (kind < len(FACTORS) and type(each) is type(factor))
         )
-        kind = next(known, len(self._factors))
+        kind, count = next(known, len(self._factors)), len(np.asarray(information))
+        if kind >= len(FACTORS) or (kind, count) not in self._counts:
+            T_i, T_j = self.poses[[i, j]]  # copies
+            factor.check(T_j if i == ORIGIN else lie.between(T_i, T_j), Z, count)
+            self._counts.add((kind, count))
         name = type(factor).__name__
         if i == ORIGIN and kind in RELATIVE:
             raise InputError(f"{name} is measured from another pose; give i, or take Prior or Position")
