@@ -21,7 +21,7 @@ _SHAPES = {
     "sigma_odom": "(2, 2)",
     "sigma_landmark": "(2, 2)",
 }
-_LARGEST = 1e-9 * np.iinfo(np.int64).max  # seconds that fit 64 bits of nanoseconds
+_LARGEST = 9e9  # seconds above which a time does not fit 64 bits of nanoseconds
 _TRUTH = ("gt_traj", "gt_landmarks")  # arrays that a problem may lack
 
 
