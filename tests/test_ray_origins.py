@@ -78,6 +78,16 @@ def test_origins_go_from_the_scan_into_keyframes_and_saved_maps(tmp_path):
         assert len(seen) == each.stored.spans[1].rays > 50
 
 
+@pytest.mark.parametrize("counts", [(-1, 3), (1, 2), (0, 0)])
+def test_spans_that_are_not_those_of_the_points_are_refused(tmp_path, counts):
+    spans = tuple(RaySpan(np.zeros(2), count) for count in counts)
+    edges = Edges(np.empty((0, 2), int), np.empty((0, 3, 3)), np.empty((0, 3, 3)), np.empty(0, bool), np.empty(0))
+    session, keyframes = Session("made up", 0, 1, 1), (keyframe(WALL[:2], spans),)
+    write_saved_map(SavedMap(tmp_path / "map", 2, keyframes, np.zeros(1, int), (session,), edges))
+    with pytest.raises(InputError, match="spans"):
+        open_saved_map(tmp_path)
+
+
 def test_an_origin_that_is_none_is_refused():
     with pytest.raises(InputError, match="origin"):
         replace(Scan.of(WALL, 0.0), origin=np.zeros(3))

@@ -195,6 +195,7 @@ def open_saved_map(path: Path) -> SavedMap:
         _check_range(rows["session"], "session", len(index.sessions))
         _check_range(edges["pairs"], "pairs", K)
         _check_range(rows["count"], "count", index.points + 1)
+        _check_range(rows["spans"][:, 1], "spans", index.points + 1)
         if (np.abs(rows["step_m"]) > _MOST_STEP_M).any():
             raise ValueError(
                 f"step_m reaches {np.abs(rows['step_m']).max():.3g} m; wanted at most {_MOST_STEP_M:g}"
