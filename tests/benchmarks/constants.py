@@ -117,21 +117,23 @@ class Changed:
     """A constant with another value, in all modules that imported it."""
 
     def __init__(self, constant: Constant, factor: float) -> None:
-        self.constant, self.value = constant, scaled(constant.value, factor)
+        self.name = constant.name
+        self.usual = getattr(importlib.import_module(constant.module), constant.name)
+        self.value = scaled(self.usual, factor)
         self.holders = [
             module
             for name, module in list(sys.modules.items())
-            if name.startswith("scanchain") and getattr(module, constant.name, None) is constant.value
+            if name.startswith("scanchain") and getattr(module, constant.name, None) is self.usual
             and (name == constant.module or not constant.name.startswith("_"))
         ]  # fmt: skip
 
     def __enter__(self) -> None:
         for module in self.holders:
-            setattr(module, self.constant.name, self.value)
+            setattr(module, self.name, self.value)
 
     def __exit__(self, *_: object) -> None:
         for module in self.holders:
-            setattr(module, self.constant.name, self.constant.value)
+            setattr(module, self.name, self.usual)
 
 
 def reading(code: CodeType) -> Iterator[str]:
