@@ -19,23 +19,10 @@ from scanchain.simulation.solids import Solids
 
 _SWAY_HERTZ = np.array([1.3, 0.9, 1.1, 0.8, 0.6])  # heave, roll, pitch, sideways, heading
 
-
-class WheelErrors(NamedTuple):
-    """Errors of wheel odometry, as of a robot with differential drive that was never calibrated.
-
-    scale, turn : relative errors of distance and angle: the wheels' assumed size and distance are wrong
-    bias_rad_per_m : turn per meter, because one wheel is larger than the other
-    noise_m, noise_rad : slip along the path and in heading, standard deviations per √m
-    """
-
-    scale: float = 0.01
-    turn: float = 0.02
-    bias_rad_per_m: float = 0.0005
-    noise_m: float = 0.01
-    noise_rad: float = 0.004
-
-
-_WHEELS = WheelErrors()
+_SCALE_SHARE = 0.01  # relative error of the distance: the wheels are not of the assumed size
+_TURN_SHARE = 0.02  # relative error of the angle: the wheels are not at the assumed distance
+_BIAS_RAD_PER_M = 0.0005  # turn per meter, because one wheel is larger than the other
+_NOISE_M, _NOISE_RAD = 0.01, 0.004  # slip along the path and in heading, standard deviations per √m
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +130,10 @@ def wheel_odometry(
     traveled = np.linalg.norm(steps[:, :2, 2], axis=1)
     scale, turn, bias = drift * rng.choice([-1.0, 1.0], 3) * rng.uniform(0.5, 1.5, 3)
     noise = drift * np.sqrt(traveled)[:, None] * rng.standard_normal((len(steps), 2))
-    moved = steps[:, :2, 2] * (1.0 + scale * _WHEELS.scale)
-    moved[:, 0] += _WHEELS.noise_m * noise[:, 0] + slips_m
+    moved = steps[:, :2, 2] * (1.0 + scale * _SCALE_SHARE)
+    moved[:, 0] += _NOISE_M * noise[:, 0] + slips_m
     turned = (
-        lie.yaw(steps) * (1.0 + turn * _WHEELS.turn)
-        + bias * _WHEELS.bias_rad_per_m * traveled
-        + _WHEELS.noise_rad * noise[:, 1]
+        lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * traveled + _NOISE_RAD * noise[:, 1]
     )
     poses = lie.exp(np.outer(np.concatenate([[0.0], np.cumsum(turned)]), [0.0, 0.0, 1.0]))  # at the origin
     c, s = poses[:-1, 0, 0], poses[:-1, 1, 0]
@@ -165,7 +150,7 @@ class Profile(NamedTuple):
 
     @property
     def extent_s(self) -> float:
-        """How far the smoothing extends: gaussian_filter1d stops at four standard deviations."""
+        """Extent of the smoothing, on each side: gaussian_filter1d stops at four standard deviations."""
         return 4.0 * self.ease_s
 
     def eased(self, speeds: Matrix) -> Matrix:

@@ -39,7 +39,7 @@ _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of 3D points, by height
 
 
 class PointStyle(NamedTuple):
-    """How points of a map become an image, which is part of the page.
+    """Rendering of the points of a map as an image, which is part of the page.
 
     most : largest number of points; further ones are left out
     pixels_per_root, widths : width of the image per square root of its points, and its limits, pixels

@@ -7,7 +7,7 @@ correction that loop closures make. A 2D log is drawn in the plane z = 0.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -18,7 +18,7 @@ from scanchain.data import State
 from scanchain.steps import STAGES
 from scanchain.verdict import Kind
 from scanchain_viz.colors import SEGMENT_COLORS, between, height_shares, rgb
-from scanchain_viz.recording.drawing import Color, Floats, Message, dots, lines, pixels
+from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels
 
 WORLD = "world"
 ODOM = "world/odom"
@@ -59,25 +59,13 @@ SERIES = {  # plots of one series each, and their names
 }
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
+YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
+BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
+CYAN, PALE_GREEN = (70, 210, 210), (190, 240, 160)
 
-class Palette(NamedTuple):
-    """Colors, red, green and blue, on the dark background of scenes; ``heights`` from low to high."""
+_HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
 
-    background: Color = (13, 16, 17)  # also in a light viewer: lines of ground truth are white
-    yellow: Color = (255, 205, 60)
-    gray: Color = (110, 120, 135)
-    white: Color = (235, 235, 235)
-    blue: Color = (70, 150, 255)
-    green: Color = (60, 200, 90)
-    pale_green: Color = (190, 240, 160)
-    red: Color = (235, 70, 60)
-    orange: Color = (255, 140, 40)
-    violet: Color = (190, 120, 255)
-    cyan: Color = (70, 210, 210)
-    heights: tuple[Color, ...] = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
-
-
-INKS = Palette()
+_BACKGROUND = (13, 16, 17)  # of scenes, also in a light viewer: lines of ground truth are white
 _PLAY_S = 30.0  # seconds in which a recording is played
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, except in the first scans, which load the kernels
 
@@ -108,35 +96,32 @@ UP = Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 def height_colors(points: Floats) -> NDArray[np.uint8]:
     """Colors (N, 3) of points (N, 3) by height, from the 2nd to the 98th percentile."""
-    return between(INKS.heights, height_shares(points[:, 2]))
+    return between(_HEIGHT_COLORS, height_shares(points[:, 2]))
 
 
 def constants(dimension: int) -> list[Message]:
     """Static messages: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
-    stages = rr.SeriesLines(
-        names=[f"{stage} [ms]" for stage in STAGES],
-        colors=[INKS.cyan, INKS.green, INKS.blue, INKS.yellow, INKS.red],
-    )
+    stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
     marked = [rgb(SEGMENT_COLORS[kind]) for kind in (Kind.CONTRADICTED, Kind.DEGENERATE, Kind.LOST)]
-    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[INKS.green, *marked])
+    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, *marked])
     return [
         UP,
         Message(LIDAR, rr.TransformAxes3D(axis_length=size_m)),
-        Message(SCAN, dots(color=INKS.yellow, radius=2.0)),
-        Message(LOCAL_MAP, dots(color=INKS.gray, radius=1.2)),
-        Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[INKS.violet], line_radii=pixels(1.0))),
-        Message(ODOMETRY, lines(color=INKS.orange, radius=1.0)),
-        Message(TRAJECTORY, lines(color=INKS.blue, radius=1.5)),
-        Message(KEYFRAMES, dots(color=INKS.violet, radius=2.0)),
-        Message(ODOMETRY_EDGES, lines(color=INKS.gray, radius=0.75)),
+        Message(SCAN, dots(color=YELLOW, radius=2.0)),
+        Message(LOCAL_MAP, dots(color=GRAY, radius=1.2)),
+        Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[VIOLET], line_radii=pixels(1.0))),
+        Message(ODOMETRY, lines(color=ORANGE, radius=1.0)),
+        Message(TRAJECTORY, lines(color=BLUE, radius=1.5)),
+        Message(KEYFRAMES, dots(color=VIOLET, radius=2.0)),
+        Message(ODOMETRY_EDGES, lines(color=GRAY, radius=0.75)),
         Message(ACCEPTED, lines(radius=1.5)),
-        Message(REJECTED, lines(color=INKS.red, radius=0.75)),
+        Message(REJECTED, lines(color=RED, radius=0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
         Message(VERDICT, rr.TextDocument("The verdict is available at the end of the run.")),
         Message(TIME, stages),
-        *(Message(entity, rr.SeriesLines(names=[name], colors=[INKS.blue])) for entity, name in SERIES.items()),
-        Message(LOOPS, rr.SeriesLines(names=["accepted", "rejected"], colors=[INKS.green, INKS.red])),
+        *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in SERIES.items()),
+        Message(LOOPS, rr.SeriesLines(names=["accepted", "rejected"], colors=[GREEN, RED])),
         Message(STATE, states),
     ]
 
@@ -217,7 +202,7 @@ def scene(
         origin=WORLD,
         name=name,
         overrides=overrides,
-        background=INKS.background,
+        background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye,
     )
