@@ -21,6 +21,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import cache, partial
 from itertools import islice
 from multiprocessing import get_context
@@ -36,10 +37,15 @@ import scanchain
 from scanchain.commands.landmarks import landmarks
 from scanchain.commands.logs import doctor
 from scanchain.data import Matrix, Scan
+from scanchain.loops.evidence import WEIGHTS
+from scanchain.maps import open_saved_map
 from scanchain.sessions.elsewhere import import_map
 from scanchain.settings import overrides_of
 from scanchain.simulation import WORLDS
 from tests.benchmarks.harness import CACHE, drive_of, options_of, table
+from tests.benchmarks.place_odds import right, wrong
+from tests.benchmarks.places import PLACES, prepared, whole_of
+from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support import made
 from tests.support.scenes import DATA, ROOT
 
@@ -292,6 +298,34 @@ def of_graphs(folder: Path) -> bytes:
     return text
 
 
+def of_wrong_edges(folder: Path) -> bytes:
+    """Graphs with wrong loops that agree with each other."""
+    found = [try_wrong_loops(DATA / f"graphs/{name}.g2o", 0.3, "groups", 0) for name in ("MIT", "intel")]
+    return repr([replace(each, time_s=0.0) for each in found]).encode()
+
+
+def of_features(folder: Path) -> bytes:
+    """What keyframes show at right poses in a map and at the best wrong ones, and its log-odds."""
+    maps = [open_saved_map(whole_of(name, CACHE)) for name in ("csail", "intel")]
+    shown = [*islice(right("csail-76", CACHE), 30), *islice(wrong(*maps, []), 60)]
+    ratios = [float(np.array(WEIGHTS) @ each) for each in shown]
+    return repr((shown, ratios)).encode()
+
+
+def of_places(folder: Path) -> bytes:
+    """Parts of logs that enter a map late, and logs in maps of other places: all poses and their states."""
+    found = []
+    for name in ("csail-76", "forest"):
+        prior, log, options, *_ = prepared(name, 0, CACHE)
+        found.append(scanchain.localize(log, prior, folder / name, recording=False, **options).path)
+    for guest, host in (("mocap", "csail"), ("kitti-5", "kitti-1")):
+        log, options = PLACES[guest].of(0, CACHE)
+        prior = made.run_of(PLACES[host].of(0, CACHE)[0], CACHE, f"{host}_0")
+        options = options | {"log__end_s": 30.0}
+        found.append(scanchain.localize(log, prior, folder / guest, recording=False, **options).path)
+    return b"".join(map(of_directory, found))
+
+
 def of_landmarks(folder: Path) -> bytes:
     """A log of ranges and bearings, and a problem far from its solution."""
     for name, options in (("utias_mrclam6", ()), ("2d_nonlinear.npz", ("--guess", "disturbed"))):
@@ -316,6 +350,7 @@ CASES: dict[str, Case] = {
     "lost in a building": of_log("2d/mit_csail.mcap", 300, range(60, 120), odometry__prior="constant-velocity"),
     "standing in a room": of_log("reports/rplidar_standing.bag", 100),
     "kitti": of_log("3d/kitti_0005_first60.mcap", 20),
+    "elevation": of_log("3d/kitti_0005_first60.mcap", 45),
     "svd-icp": of_log("3d/kitti_0001_first54.mcap", 8, matching__matcher="svd"),
     "pandaset": of_log("3d/pandaset_002_sweeps30to55.mcap", 8, topic="/pandar64/points"),
     "standing in a street": of_standing,
@@ -327,6 +362,9 @@ CASES: dict[str, Case] = {
     "drive": of_drive,
     "sessions": of_sessions,
     "graphs": of_graphs,
+    "wrong edges": of_wrong_edges,
+    "features": of_features,
+    "places": of_places,
     "landmarks": of_landmarks,
     "doctor": of_doctor,
     "simulation": of_simulation,
