@@ -306,8 +306,8 @@ def of_wrong_edges(folder: Path) -> bytes:
 
 def of_features(folder: Path) -> bytes:
     """What keyframes show at right poses in a map and at the best wrong ones, and its log-odds."""
-    maps = [open_saved_map(whole_of(name, CACHE)) for name in ("csail", "intel")]
-    shown = [*islice(right("csail-76", CACHE), 30), *islice(wrong(*maps, []), 60)]
+    guest, host = (open_saved_map(whole_of(name, CACHE)) for name in ("csail", "intel"))
+    shown = [*islice(right("csail-76", CACHE), 30), *islice(wrong(guest, host, []), 60)]
     ratios = [float(np.array(WEIGHTS) @ each) for each in shown]
     return repr((shown, ratios)).encode()
 
