@@ -28,7 +28,7 @@ def _one_of(choices: dict[str, str]) -> Meta:
     return Meta(pattern=rf"^({'|'.join(choices)}|{CLASS_NAME})\Z", extra={"choices": tuple(choices)})
 
 
-NO_TRUTH = "none"  # of ``log.ground_truth_topic``
+NO_TOPIC = "none"  # of ``log.ground_truth_topic`` and ``log.imu_topic``
 
 MATCHERS = {
     "plicp": "scanchain.registration.plicp:PointToShapeMatcher",
@@ -65,6 +65,8 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     odometry_topic : wheel odometry, ``nav_msgs/Odometry``, stamped poses, or transforms with odom → base_link;
         found automatically where empty
     ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
+    imu_topic : IMU, ``sensor_msgs/Imu``, whose gyro is used where it predicts rotations better than the scans;
+        found automatically where empty, ``none`` leaves it unused
     upside_down : whether a planar lidar hangs upside down although no transform says so: its scans are mirrored
     start_s : everything before this time, counted from the first message, is skipped
     end_s : everything after this time, counted from the first message, is skipped
@@ -86,6 +88,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     topic: str = ""
     odometry_topic: str = ""
     ground_truth_topic: str = "/ground_truth"
+    imu_topic: str = ""
     upside_down: bool = False
     start_s: NonNegative = 0.0
     end_s: Limit = float("inf")

@@ -85,6 +85,21 @@ class RaySpan(NamedTuple):
         return tuple(RaySpan(span.origin, count) for span, count in zip(spans, rays, strict=True))
 
 
+class Inertial(NamedTuple):
+    """Samples of an IMU from the scan before to the end of a scan.
+
+    stamps_ns : (M,) ascending, by the clock of the scans
+    rates : (M, 3) rad/s
+    accelerations : (M, 3) m/s², at rest 9.8 upwards
+    R_lidar_imu : (3, 3) rotation from the frame of both to that of the lidar; None where it is unknown
+    """
+
+    stamps_ns: Integers
+    rates: Matrix
+    accelerations: Matrix
+    R_lidar_imu: Matrix | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Scan:
     """One scan as the log holds it, invalid returns removed.
@@ -101,6 +116,7 @@ class Scan:
     clock_jump_s : jump of the stamp since the previous scan for which no time passed; usually 0
     others : points of other lidars that publish on the topic, measured just before; usually none
     origin : (d,) meters, where the lidar is in the frame of its points; None where it is the origin of that frame
+    inertial : samples of an IMU; None where the log has none
 
     Arrays are converted if nothing is lost; any other shape, dtype or value raises InputError.
     """
@@ -118,6 +134,7 @@ class Scan:
     clock_jump_s: float = 0.0
     others: tuple[OtherPoints, ...] = ()
     origin: Vector | None = None
+    inertial: Inertial | None = None
 
     def __post_init__(self) -> None:
         """Check and convert; the class is frozen, so that the checks stay valid."""
@@ -143,6 +160,7 @@ class Scan:
         *,
         index: int = -1,
         T_odom_base: Pose | None = None,
+        inertial: Inertial | None = None,
     ) -> Scan:
         """A scan as a driver gives it.
 
@@ -151,6 +169,7 @@ class Scan:
         times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
         index : if it is left out, odometry numbers the scan, and checks its stamp against the last ones
         T_odom_base : pose of the robot by its wheels at ``stamp_s``
+        inertial : samples of an IMU since the scan before
         """
         from scanchain import checks
 
@@ -158,7 +177,8 @@ class Scan:
         valid, is_valid = checks.valid_points(points, "points", dtype=np.float32)
         seconds = checks.point_times(times_s, "times_s", len(is_valid))
         seconds = seconds[is_valid] if len(seconds) else seconds
-        return cls(index, stamp_ns, stamp_ns, valid, seconds, len(is_valid) - len(valid), T_odom_base)
+        dropped = len(is_valid) - len(valid)
+        return cls(index, stamp_ns, stamp_ns, valid, seconds, dropped, T_odom_base, inertial=inertial)
 
 
 class State(StrEnum):

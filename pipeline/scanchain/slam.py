@@ -52,7 +52,7 @@ class SlamResult:
     ``elevation_sigma_rad`` its standard deviation, infinite where none was estimated.
     ``map_errors`` are those of the keyframes relative to the map.
     ``warnings`` has a line on wheel odometry that was not used; ``T_base_lidar`` (d+1, d+1) is the mounting as
-    given, or as estimated from the wheels, which ``mounting_note`` describes.
+    given, or as estimated from the wheels. ``sensor_notes`` describe what was found out about the other sensors.
     ``map_log_odds`` are those of the log's location in a prior map, or of the best one if none was accepted; NaN
     without a map, and if no keyframe was evidence for a location in it.
     ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
@@ -74,7 +74,7 @@ class SlamResult:
     config: Config
     steps: Steps
     warnings: tuple[str, ...] = ()
-    mounting_note: str = ""
+    sensor_notes: tuple[str, ...] = ()
     T_base_lidar: Pose | None = None
     elevation_offset_rad: float = 0.0
     elevation_sigma_rad: float = math.inf
@@ -214,8 +214,8 @@ class Slam:
             map_errors=tuple(back_end.errors),
             config=self.config,
             steps=self.steps,
-            warnings=tracking.predictor.wheels.warnings(),
-            mounting_note=tracking.predictor.wheels.mounting.finish(),
+            warnings=tracking.predictor.warnings(),
+            sensor_notes=tracking.predictor.notes(),
             T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,

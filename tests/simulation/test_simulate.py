@@ -170,6 +170,18 @@ def test_turns_are_made_on_the_spot_at_120_degrees_a_second():
     assert np.linalg.norm(poses[:, :2, 3], axis=1).max() < 5.0
 
 
+def test_at_another_pace_the_same_poses_are_passed_sooner():
+    usual, fast = planned("turns", "vlp-16"), plan("turns", sensor="vlp-16", pace=200.0 / 120.0)
+    times = np.arange(0.0, 20.0, 0.01)
+    poses, sooner = (
+        lie.flatten(drive.motion.base(times * pace)) for drive, pace in ((usual, 5.0 / 3.0), (fast, 1.0))
+    )
+    assert np.allclose(poses, sooner, atol=0.01)  # the body sways as often
+    rate = np.rad2deg(lie.wrap(np.diff(lie.yaw(sooner))) / 0.01)
+    assert np.abs(rate).max() == pytest.approx(200.0, abs=2.0)
+    assert len(fast.scans) == len(usual.scans)
+
+
 def test_the_staircase_is_climbed_with_a_swaying_hand():
     drive = planned("staircase", "vlp-16")
     poses = drive.motion.lidar(np.arange(0.0, 40.0, 0.05))
@@ -403,6 +415,7 @@ def test_a_town_log_reads_back(tmp_path):
         ({"dropout": 1.5}, "choose one from 0 to 1"),
         ({"noise_m": float("nan")}, "noise_m nan"),
         ({"seed": -1}, "seed -1"),
+        ({"pace": 0.0}, "pace 0 is out of range"),
         ({"start_m": -1.0}, "start_m -1 is out of range"),
         ({"world": "turns", "reverse": True}, "turns has no closed route"),
         ({"wheels_slip": Slip(3.0, 2.0, 1.0)}, "wheels_slip from 3 to 2 s"),

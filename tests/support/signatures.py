@@ -28,6 +28,8 @@ _RUNS = {
         "localize {0}/soon.mcap --map {0}/town --out {0}/near",
         "run {0}/soon.mcap --out {0}/there --rerun off --error-bars quick --matcher svd",
         "merge {0}/town {0}/there --out {0}/both",
+        "simulate turns {0}/turns.mcap --duration 4 --imu mems",
+        "run {0}/turns.mcap --out {0}/turns --rerun off --error-bars quick --odometry.prior constant-velocity",
     ),
 }
 

@@ -199,6 +199,7 @@ def convert(
     "--duration", "duration_s", type=float, metavar="SECONDS", help="Length of the drive. [default: the world's]"
 )
 @click.option("--sensor", metavar="NAME", help="Lidar: lms-270, utm-30, hdl-64, os1-32, vlp-16 or rosette.")
+@click.option("--imu", metavar="NAME", help="Add an IMU at 200 Hz, one of those above. [default: none]")
 @click.option(
     "--drift", default=1.0, show_default=True, metavar="FACTOR", help="Scale of the errors of the wheel odometry."
 )
@@ -229,6 +230,13 @@ def convert(
 @click.option(
     "--start-at", "start_m", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route."
 )
+@click.option(
+    "--pace",
+    default=1.0,
+    show_default=True,
+    metavar="FACTOR",
+    help="Drive so many times as fast; at 1.67 the world turns has turns of 200 deg/s.",
+)
 @options.force("an existing file")
 def simulate(world: str, destination: Path, wheels_slip: tuple[float, float, float] | None, **given: Any) -> None:
     """Write a synthetic log with exact ground truth, and the truth next to it as .tum.
@@ -251,6 +259,21 @@ def simulate(world: str, destination: Path, wheels_slip: tuple[float, float, flo
     same seed, and what is different in it (in office, identical, town, rounds, gap) is listed in DST.changes.csv.
 
     \b
+    NAME of the IMU is one of
+      ideal              without errors
+      mems               noise, bias and its random walk as of a factory-calibrated MEMS IMU
+      mems-g             acceleration in g in place of m/s²
+      mems-degrees       angular velocity in deg/s in place of rad/s
+      mems-sign          angular velocity of the wrong sign
+      mems-frozen        values stop changing after 10 s
+      mems-saturated     angular velocity limited to 60 deg/s about each axis
+      mems-late          stamps 0.3 s late
+      mems-half-late     stamps half a sample late
+      mems-vibration     mounted on an engine: 3 deg/s and 3 m/s² of noise
+      mems-no-transform  mounted on its side, without a transform
+    Its topic is /imu/data, its frame imu_link, turned by 90 deg about z on base_link.
+
+    \b
     Examples:
       scanchain simulate office office.mcap
       scanchain simulate town town.mcap --duration 20 --seed 3
@@ -259,6 +282,7 @@ def simulate(world: str, destination: Path, wheels_slip: tuple[float, float, flo
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
       scanchain simulate town again.mcap --changed 1 --reverse --start-at 100
       scanchain simulate office slips.mcap --wheels-slip 20 24 3
+      scanchain simulate turns imu.mcap --imu mems --pace 1.67
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")

@@ -12,7 +12,7 @@ from typing import Any
 import click
 import msgspec
 
-from scanchain.config import NO_TRUTH
+from scanchain.config import NO_TOPIC
 from scanchain.errors import InputError
 from scanchain.files import source_of
 from scanchain.processes import MIB_PER_GIB
@@ -159,7 +159,7 @@ def ground_truth(
         if text is None:
             return None
         path = Path(text)
-        if text == NO_TRUTH or (text.startswith("/") and not path.exists() and not path.suffix):
+        if text == NO_TOPIC or (text.startswith("/") and not path.exists() and not path.suffix):
             ctx.meta.setdefault(_ALIASES, []).append(Override("log.ground_truth_topic", text, "--gt"))
             return None
         return path

@@ -15,7 +15,7 @@ from scanchain.comparison.methods import default_names, resolve, shared_settings
 from scanchain.comparison.processes import StoredScans, run_all, store
 from scanchain.comparison.results import Reference, results_of, summarize, write_results
 from scanchain.comparison.table import Table, write_table
-from scanchain.config import NO_TRUTH
+from scanchain.config import NO_TOPIC
 from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError, counted
 from scanchain.evaluation import absolute_error_of_any_path, pair, read_relations, read_truth, relation_error
@@ -124,7 +124,7 @@ def _reference(
     truth, source = log.ground_truth(), log.ground_truth_topic
     if truth_file is not None:
         truth, source = read_truth(truth_file).at(scans.stamps_ns), str(truth_file)
-    elif topic not in ("", NO_TRUTH) and truth is None:
+    elif topic not in ("", NO_TOPIC) and truth is None:
         raise InputError(f"{log.name}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:

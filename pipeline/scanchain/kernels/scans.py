@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry import perturb
+from scanchain.kernels.geometry import between, inverse, perturb
 from scanchain.kernels.voxels import EMPTY, find, first_slot, pack
 
 _MOST_STEPS = 100.0  # of 1 rad per sweep; no lidar turns faster
@@ -123,6 +123,66 @@ def deskew_in_space(points, shares, twist):
             flat[3 * i] = u + share * ru + y * ew - z * ev
             flat[3 * i + 1] = v + share * rv + z * eu - x * ew
             flat[3 * i + 2] = w + share * rw + x * ev - y * eu
+
+
+@njit(nogil=True)
+def poses_along(knots_s, rates, velocity, step_rad: float):
+    """Times (P,) and poses (P, d+1, d+1) of the lidar in its own frame at time 0, which lies between two knots.
+
+    knots_s : (K,) ascending; rates : (K−1, r) rad/s between them, r = 1 in the plane, 3 in space
+    velocity : (d,) m/s, like the rates in the lidar's frame of each instant
+    step_rad : largest rotation from one pose to the next
+    """
+    d, r = velocity.size, rates.shape[1]
+    parts = np.empty(rates.shape[0], np.int64)
+    for k in range(parts.size):
+        turn = np.sqrt(np.sum(rates[k] * rates[k])) * (knots_s[k + 1] - knots_s[k])
+        parts[k] = max(math.ceil(turn / step_rad), 1)
+    times_s, inverses = np.empty(parts.sum() + 1), np.empty((parts.sum() + 1, d + 1, d + 1))
+    T, origin, twist = np.eye(d + 1), np.zeros(3), np.empty(d + r)
+    middle, count = np.eye(d + 1), 0
+    for k in range(parts.size):
+        step_s = (knots_s[k + 1] - knots_s[k]) / parts[k]
+        for part in range(parts[k]):
+            begin_s = knots_s[k] + part * step_s
+            times_s[count], inverses[count] = begin_s, T
+            if begin_s <= 0.0:
+                twist[:d], twist[d:] = begin_s * velocity, begin_s * rates[k]
+                perturb(twist, T.copy(), origin, middle)
+            twist[:d], twist[d:] = -step_s * velocity, -step_s * rates[k]
+            perturb(twist, T.copy(), origin, T)
+            count += 1
+    times_s[count], inverses[count] = knots_s[-1], T
+    poses, to_middle = np.empty_like(inverses), inverse(middle)
+    for k in range(count + 1):
+        poses[k] = between(to_middle, inverse(inverses[k]))
+    return times_s, poses
+
+
+@njit(nogil=True)
+def deskew_along(points, times_s, knots_s, poses):
+    """Move each point, in place, by the pose of the lidar at its time, linear between knots close together.
+
+    points : (N, d) meters, each in the lidar frame of its own instant, at times_s (N,)
+    knots_s : (K,) ascending; poses : (K, d+1, d+1) of the lidar at these, in the frame that is wanted
+    """
+    d, last = points.shape[1], knots_s.size - 2
+    k, moved = 0, np.empty(3)
+    for i in range(points.shape[0]):
+        at_s = times_s[i]
+        while k < last and at_s >= knots_s[k + 1]:
+            k += 1
+        while k > 0 and at_s < knots_s[k]:
+            k -= 1
+        share = (at_s - knots_s[k]) / (knots_s[k + 1] - knots_s[k])
+        for row in range(d):
+            total = poses[k, row, d] + share * (poses[k + 1, row, d] - poses[k, row, d])
+            for column in range(d):
+                between = poses[k, row, column] + share * (poses[k + 1, row, column] - poses[k, row, column])
+                total += between * points[i, column]
+            moved[row] = total
+        for row in range(d):
+            points[i, row] = moved[row]
 
 
 @njit(nogil=True)

@@ -46,7 +46,9 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
         "scans": log.scan_count if log else 0,
         "odometry": log.odometry_topic if log else wheels,
         "wheels": log.wheels if log else wheels,
-        "sensors": other_sensors(indexes, wheels=wheels, truth=truth),
+        "sensors": other_sensors(
+            indexes, wheels=wheels, truth=truth, imu=log.imu.topic if log and log.imu else ""
+        ),
         "point_times": log.assumed_point_times() if log else "",
         "T_base_lidar": log.T_base_lidar.tolist() if log else [],
         "base_frame": log.mounting.base if log else "",

@@ -21,12 +21,20 @@ from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
 from scanchain.logs import stream
 from scanchain.logs.bad_scans import ScanCounts, defect
-from scanchain.logs.index import Decoded, FileIndex, name_of
+from scanchain.logs.index import Channel, Decoded, FileIndex, name_of
 from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
 from scanchain.logs.messages.point_times import UNTIMED, PointTimes
 from scanchain.logs.messages.poses import StampedPose
-from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
+from scanchain.logs.messages.readers import Read, is_scan, pose_reader, reader
+from scanchain.logs.mounting import (
+    Wheels,
+    between_frames,
+    find_imu,
+    find_mounting,
+    find_wheels,
+    in_plane,
+    is_upside_down,
+)
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
 from scanchain.logs.samples import NEAREST_NS, Recorded
@@ -81,6 +89,8 @@ class Log:
     distortion : motion distortion of scans without point times, as text; empty if it is removed
     distorted_share : share of the motion between scans that distorts them, if it is not removed
 
+    imu : its IMU; None if it has none, or several
+
     Set by reading, once ``scans`` is exhausted or closed:
     bad_scans, scans_with_wheels : number of scans left out, and with a wheel reading near their stamp
     times : reader of the point times; jumps : warnings about jumps or a wrong rate of the header stamps
@@ -132,8 +142,8 @@ class Log:
         self.T_base_lidar: Pose = in_plane(T) if is_planar else T
         self.stated_mounting = self.T_base_lidar if mounting.is_stated else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]
-        with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
-        self.pose_decoders = {each.topic: pose_reader(each, self.dimension, link) for each, link in with_poses}
+        self.imu = find_imu(indexes, config.imu_topic, self.publishers.frame, self.span, self.notes)
+        self.sample_decoders = self._sample_decoders(wheels, truth)
         self.scans_with_wheels, self.bad_scans, self.distorted_share = 0, 0, 0.0
         self.distortion, self.jumps, self._truth = "", list[str](), None
         self._opening_notes = tuple(self.notes)
@@ -181,7 +191,7 @@ class Log:
         """
         self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
-        recorded = Recorded(self.odometry_topic, self.ground_truth_topic)
+        recorded = Recorded(self.odometry_topic, self.ground_truth_topic, self.imu, is_mirrored=self.is_mirrored)
         counts = ScanCounts(self.topic, self.odometry_topic)
         self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic, self.times)
@@ -212,6 +222,7 @@ class Log:
                     clock_jump_s=jump_s,
                     others=others,
                     origin=own.origin if own.origin.any() else None,
+                    inertial=recorded.inertial(returns),
                 )
                 counts.add(scan)
                 self.scans_with_wheels += T_odom_base is not None
@@ -266,7 +277,7 @@ class Log:
         topic : the lidar's or the ground truth's
         Raises InputError if the topic has no usable message there.
         """
-        decode = self.pose_decoders.get(topic) or self.decoder(self._point_times())
+        decode = self.sample_decoders.get(topic) or self.decoder(self._point_times())
         why, unset = "", None
         for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             value = message.value
@@ -286,7 +297,7 @@ class Log:
         """Poses of ``log.ground_truth_topic`` or None; read separately if ``scans`` is not exhausted."""
         topic = self.ground_truth_topic
         if self._truth is None and topic:
-            recorded, decoders = Recorded("", topic), {topic: self.pose_decoders[topic]}
+            recorded, decoders = Recorded("", topic), {topic: self.sample_decoders[topic]}
             for message in stream.decoded_messages(self.indexes, decoders, self.span, damage=[]):
                 recorded.add(message)
             self._truth = recorded.ground_truth(self._lidar_on)
@@ -299,11 +310,20 @@ class Log:
         T = np.eye(4) if T is None else T
         return in_plane(T) if self.dimension == 2 else T
 
+    def _sample_decoders(self, wheels: Wheels | None, truth: Channel | None) -> dict[str, Read]:
+        """Readers of the messages of the other sensors, by topic."""
+        found: dict[str, Read] = {} if self.imu is None else {self.imu.topic: self.imu.read}
+        if wheels is not None:
+            found[wheels.channel.topic] = pose_reader(wheels.channel, self.dimension, wheels.link)
+        if truth is not None:
+            found[truth.topic] = pose_reader(truth, self.dimension)
+        return found
+
     def _with_samples(
         self, counts: ScanCounts, recorded: Recorded, assembler: Assembler | None
     ) -> Iterator[tuple[Decoded, Pose | None]]:
         """Scans with the wheel odometry pose at their stamp; they are held back briefly for samples after them."""
-        decoders = {self.topic: self.decoder(self.times), **self.pose_decoders}
+        decoders = {self.topic: self.decoder(self.times), **self.sample_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
         messages = messages if assembler is None else assembler.sweeps(messages)
@@ -319,7 +339,7 @@ class Log:
                 or len(waiting) > _HOLD_SCANS
                 or message.log_time_ns - waiting[0].log_time_ns > NEAREST_NS
                 or not isinstance(first := waiting[0].value, Returns)
-                or recorded.covers(first.stamp_ns)
+                or recorded.covers(first)
             ):
                 scan = waiting.popleft()
                 wheels = recorded.odometry.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None

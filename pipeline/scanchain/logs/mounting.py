@@ -1,4 +1,4 @@
-"""Transforms of a log: the mounting of the lidar on the robot, and wheel odometry that is only on /tf."""
+"""Transforms of a log: mountings of lidar and IMU on the robot, and wheel odometry that is only on /tf."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from scanchain import lie
-from scanchain.config import LogConfig
-from scanchain.data import Pose
+from scanchain.config import NO_TOPIC, LogConfig
+from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.logs.index import Channel, FileIndex, name_of
+from scanchain.logs.messages.inertial import ImuSample
 from scanchain.logs.messages.poses import Frames, StampedPose, chain
-from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, reader, role
+from scanchain.logs.messages.readers import Read, is_moving_transforms, pose_reader, reader, role
 from scanchain.logs.stream import Span, sampled_messages
 from scanchain.logs.topics import find_odometry, topics_of
 
@@ -114,6 +115,40 @@ def find_wheels(
     steps_ns = np.diff(np.unique([each.stamp_ns for each in poses]))
     rate_hz = 1e9 / float(np.median(steps_ns)) if len(steps_ns) else 0.0
     return Wheels(channel, f"{channel.topic}: {names}, {rate_hz:.3g} Hz", found[0])
+
+
+class Imu(NamedTuple):
+    """An IMU: topic, reader of its messages, and rotation (3, 3); None where the log does not state it."""
+
+    topic: str
+    read: Read
+    R_lidar_imu: Matrix | None
+
+
+def find_imu(indexes: Sequence[FileIndex], wanted: str, frame: str, span: Span, notes: list[str]) -> Imu | None:
+    """The IMU of the configured topic, else the only one; None for ``NO_TOPIC``, or if there are several.
+
+    frame : of the lidar
+    Raises InputError if the configured topic is not one of an IMU.
+    """
+    found = {each.topic: each for each in topics_of(indexes).values() if role(each) == "imu"}
+    if wanted in found:
+        return _imu_of(indexes, found[wanted], frame, span)
+    names = ", ".join(found)
+    if wanted not in ("", NO_TOPIC):
+        known = f"these are: {names or 'none'}"
+        raise InputError(f"{name_of(indexes)}: log.imu_topic {wanted} is not a topic of sensor_msgs/Imu; {known}")
+    if len(found) > 1 and not wanted:
+        notes.append(f"several IMUs ({names}), none is used; choose with --log.imu_topic")
+    return _imu_of(indexes, next(iter(found.values())), frame, span) if len(found) == 1 and not wanted else None
+
+
+def _imu_of(indexes: Sequence[FileIndex], channel: Channel, frame: str, span: Span) -> Imu:
+    read = reader(channel)
+    first = next(sampled_messages(indexes, channel.topic, read), None)
+    own = first.value.frame if first is not None and isinstance(first.value, ImuSample) else ""
+    T = np.eye(4) if own and own == frame else between_frames(indexes, span, frame, own) if own and frame else None
+    return Imu(channel.topic, read, None if T is None else T[:3, :3])
 
 
 class MovingFrame(NamedTuple):

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from scanchain.data import Pose, Trajectory
+from scanchain.data import Inertial, Pose, Trajectory
 from scanchain.errors import counted
 from scanchain.logs.index import Decoded
+from scanchain.logs.messages.inertial import ImuSample
+from scanchain.logs.messages.point_times import Returns
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.ros import MalformedMessageError
+from scanchain.logs.mounting import Imu
 
-_RETAINED = 512  # samples in memory; a scan is held back for half a second, so this suffices up to 1000 Hz
+_RETAINED = 4096  # samples in memory: of 2 s and more at 2000 Hz
 NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and that a scan waits for it
 
 
@@ -79,9 +82,18 @@ class Recorded:
     truth : poses of the ground truth in the order of the log
     """
 
-    def __init__(self, odometry_topic: str, ground_truth_topic: str) -> None:
-        self.odometry, self.ground_truth_topic = SampleStream[StampedPose](), ground_truth_topic
-        self.streams = {odometry_topic: self.odometry} if odometry_topic else {}
+    def __init__(
+        self, odometry_topic: str, ground_truth_topic: str, imu: Imu | None = None, *, is_mirrored: bool = False
+    ) -> None:
+        """is_mirrored : whether a planar lidar hangs upside down; its frame is then as seen from above."""
+        self.odometry, self.imu = SampleStream[StampedPose](), SampleStream[ImuSample]()
+        self.R_lidar_imu = None if imu is None else imu.R_lidar_imu
+        if self.R_lidar_imu is not None and is_mirrored:
+            self.R_lidar_imu = np.diag([1.0, -1.0, -1.0]) @ self.R_lidar_imu
+        self._given_ns = 0  # stamp of the last sample that a scan has
+        named = {odometry_topic: self.odometry, "" if imu is None else imu.topic: self.imu}
+        self.streams: dict[str, SampleStream[Any]] = {topic: stream for topic, stream in named.items() if topic}
+        self.ground_truth_topic = ground_truth_topic
         self.truth: list[StampedPose] = []
         self._moved = ""  # frames of the truth other than the lidar's
         self._malformed: dict[str, list[str]] = {}  # by topic, the defect of each message
@@ -98,9 +110,23 @@ class Recorded:
             if topic in self.streams:
                 self.streams[topic].add(sample)
 
-    def covers(self, stamp_ns: int) -> bool:
-        """True if every stream has a sample at or after a stamp."""
-        return all(stream.covers(stamp_ns) for stream in self.streams.values())
+    def covers(self, returns: Returns) -> bool:
+        """True if every stream has a sample at or after the stamp of a scan, that of the IMU after its end."""
+        return all(
+            stream.covers(returns.end_ns if stream is self.imu else returns.stamp_ns)
+            for stream in self.streams.values()
+        )
+
+    def inertial(self, returns: Returns) -> Inertial | None:
+        """Samples of the IMU since those of the scan before, to the first after this one; None without any."""
+        after = self.imu.between(max(self._given_ns, returns.end_ns) + 1, returns.end_ns + NEAREST_NS)[:1]
+        found = self.imu.between(self._given_ns + 1, returns.end_ns) + after
+        if not found:
+            return None
+        self._given_ns = found[-1].stamp_ns
+        stamps_ns = np.array([each.stamp_ns for each in found], np.int64)
+        rates, accelerations = np.array([(each.rates, each.accelerations) for each in found]).swapaxes(0, 1)
+        return Inertial(stamps_ns, rates, accelerations, self.R_lidar_imu)
 
     def ground_truth(self, lidar_on: Callable[[str], Pose]) -> Trajectory | None:
         """True poses of the lidar so far; None if there are none.

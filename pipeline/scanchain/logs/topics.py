@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from scanchain.config import NO_TRUTH, LogConfig
+from scanchain.config import NO_TOPIC, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.index import Channel, FileIndex, damage_of, name_of
 from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_moving_transforms, kind, role
 
 _MOST_LISTED = 8  # largest number of topics in an error
 _USUAL_TRUTH = LogConfig().ground_truth_topic
-_IMU = ("sensor_msgs/Imu",)
 _GNSS = (
     "sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"
 )  # fmt: skip
@@ -68,8 +67,8 @@ def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[s
 
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | None:
-    """The ground truth's channel, None for ``NO_TRUTH``; only the default topic may be missing."""
-    if wanted == NO_TRUTH:
+    """The ground truth's channel, None for ``NO_TOPIC``; only the default topic may be missing."""
+    if wanted == NO_TOPIC:
         return None
     usual = topics_of(indexes).get(_USUAL_TRUTH)
     if wanted == _USUAL_TRUTH and not (usual and has_poses(usual)):
@@ -86,14 +85,21 @@ class OtherSensor:
     use: str
 
 
-def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> list[OtherSensor]:
-    """Ground truth, IMU, GNSS and other poses of a log; ``wheels`` and ``truth`` are the topics of these."""
+def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str, imu: str) -> list[OtherSensor]:
+    """Ground truth, IMU, GNSS and other poses of a log; ``wheels``, ``truth`` and ``imu`` are their topics."""
     found = []
     for topic, channel in topics_of(indexes).items():
         if topic == truth:
             found.append(OtherSensor("ground truth", topic, "evaluates the result, is not used for it"))
-        elif kind(channel) in _IMU or kind(channel) in _GNSS:
-            found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
+        elif role(channel) == "imu":
+            use = (
+                "its gyro predicts rotations where it does so better than the scans"
+                if topic == imu
+                else "not used"
+            )
+            found.append(OtherSensor("IMU", topic, use))
+        elif kind(channel) in _GNSS:
+            found.append(OtherSensor("GNSS", topic, "not used"))
         elif has_poses(channel) and topic != wheels:
             use = f"--gt {topic} uses them as ground truth, --log.odometry_topic {topic} as wheels"
             found.append(OtherSensor("poses", topic, f"not used; {use}"))

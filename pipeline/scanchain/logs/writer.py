@@ -75,6 +75,16 @@ def pack_odometry(
     return packed("nav_msgs/msg/Odometry", header(stamp_ns, frame), child_frame, posed, twist)
 
 
+def pack_imu(stamp_ns: int, frame: str, rate_rad_s: Sequence[float], acceleration_m_s2: Sequence[float]) -> bytes:
+    """A sensor_msgs/Imu without orientation and with unknown covariances; gravity is part of the acceleration."""
+    unknown = np.zeros(9)
+    absent = np.array([-1.0, *unknown[1:]])
+    orientation = new("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+    vectors = [new("geometry_msgs/msg/Vector3", *vector) for vector in (rate_rad_s, acceleration_m_s2)]
+    parts = orientation, absent, vectors[0], unknown, vectors[1], unknown
+    return packed("sensor_msgs/msg/Imu", header(stamp_ns, frame), *parts)
+
+
 class Link(NamedTuple):
     """Pose of the frame ``child`` in ``parent``."""
 

@@ -62,6 +62,14 @@ class MotionFilter:
         self.motion_covariance = self.any_motion
         self.pose_covariance = self.covariance = self.nothing
 
+    def turn(self, rotation: NDArray[np.float64]) -> None:
+        """Set the rotation (r,) of the motion to one that is measured; its error is in the noise."""
+        twist, d = lie.log(self.motion), -len(rotation)
+        twist[d:] = rotation
+        self.motion = lie.exp(twist)
+        self.motion_covariance, self.covariance = self.motion_covariance.copy(), self.covariance.copy()
+        self.motion_covariance[d:] = self.motion_covariance[:, d:] = self.covariance[:, d:] = 0.0
+
     def correct(self, innovation: NDArray[np.float64], information: Matrix, noise: Matrix) -> None:
         """Update by a measured pose: its innovation (k,) and information (k, k)."""
         pose, covariance, motion = self.predicted(noise)

@@ -21,7 +21,7 @@ from scanchain.odometry.intervals import LiveStamps
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import CLEARLY, Recovery, is_sound
 from scanchain.odometry.standstill import Standstill
-from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
+from scanchain.preprocess import Prepared, Resolution, ScanMotion, Sweep, prepare
 from scanchain.registration import MapKeeper, VoxelMap, create_matcher
 from scanchain.registration.align import as_ambiguous, with_source_frame
 from scanchain.settings import check_dimension, check_order, load_settings
@@ -138,6 +138,7 @@ class Odometry:
     def _tracked(self, scan: Scan | Prepared) -> Tracked:
         prepared = scan if isinstance(scan, Prepared) else prepare(scan, self.resolution)
         scan, self.resolution = prepared.scan, prepared.after
+        self.predictor.gyro.add(scan)
         self.scans += 1
         sample = scan.points[:: len(scan.points) // _SAMPLE + 1].tobytes()
         if self.last is not None and sample == self.last_sample and len(scan.points) >= _FEWEST_COPIED:
@@ -190,10 +191,10 @@ class Odometry:
         A wheel motion that no vehicle can make is rejected in any case. The scan does not count where most of the
         last ones were lost or contradicted.
         """
-        prediction = self.predictor.predict(scan)
+        prediction = self.predictor.predict(scan, sparse.middle_s)
         if prediction.jump_m == 0.0 or not len(self.map.surfaces):
             return prediction
-        free = self.predictor.predict(scan, by_wheels=False)
+        free = self.predictor.predict(scan, sparse.middle_s, by_wheels=False)
         is_wrong = lie.apart(prediction.T_odom_last, prediction.T_odom_lidar)[0] > free.farthest_m
         points = sparse.from_middle(free.scan_motion)
         if not is_wrong and len(points) and not self.predictor.doubts_scans:
@@ -301,15 +302,20 @@ class Odometry:
         """A scan aligned in the frame of its middle, moved to the frame of its stamp.
 
         The stamp lies between two middles, or just beyond: the scan moves by the mean velocity between them. In
-        rotation this changes at the rate of the last two motions, with an error as large as the change; in
-        translation the change would be noise.
+        rotation, unless a gyro measures it, this changes at the rate of the last two motions, with an error as
+        large as the change; in translation the change would be noise.
         """
         if sweep.middle_s == 0.0 or prediction.lasted_s <= 0.0:
             return tracked
-        mean = lie.log(self.predictor.T_previous_current) / prediction.lasted_s
-        change = (1.0 - sweep.middle_s / prediction.lasted_s) * (self.predictor.scan_motion.twist - mean)
+        motion, mean = self.predictor.scan_motion, lie.log(self.predictor.T_previous_current) / prediction.lasted_s
+        change = (1.0 - sweep.middle_s / prediction.lasted_s) * (motion.twist - mean)
         change[: self.dimension] = 0.0
         T_stamp_middle = lie.exp(sweep.middle_s * (mean + change))
+        if motion.turning is not None:
+            T_stamp_middle, change = (
+                lie.inverse(ScanMotion(mean, motion.turning).over(-sweep.middle_s)),
+                0.0 * change,
+            )
         T_middle_stamp = lie.inverse(T_stamp_middle)
         return msgspec.structs.replace(
             tracked,

@@ -15,6 +15,7 @@ from scanchain.data import LEAST_FIT, Match, Pose, Prior, Scan, State
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
+from scanchain.odometry.gyro import Gyro
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import ErrorStatistics, MotionFilter
 from scanchain.odometry.wheels import Wheels
@@ -27,6 +28,7 @@ _ACCELERATION_M_S2 = 4.0  # of a car; limits the search window around the predic
 _FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
 _BURST = 0.05  # of the usual interval: a shorter one is due to a burst and gives no velocity
 _JUMP = 1.0  # m and rad, difference of two motions per scan, above which the wheels may have jumped
+_LEAST_TURN = 0.3  # of a rotation in the worst direction of a scan, a unit twist, that leaves the rotation open
 _MEMORY = 0.9  # weight of the share of doubtful scans so far against the next one
 _MOST_DOUBTFUL = 0.5  # share of lost or contradicted scans, above which scans cannot refute the wheels
 
@@ -35,12 +37,13 @@ class Source(StrEnum):
     """Source of the predicted motion to a scan."""
 
     CONSTANT_VELOCITY = "constant velocity"
+    GYRO = "gyro"  # the rotation; the translation at constant velocity
     WHEELS = "wheels"
 
     @property
     def is_measured(self) -> bool:
-        """True if a sensor other than the lidar measures the motion."""
-        return self is not Source.CONSTANT_VELOCITY
+        """True if a sensor other than the lidar measures the whole motion."""
+        return self is Source.WHEELS
 
 
 class Prediction(msgspec.Struct, frozen=True):
@@ -49,7 +52,7 @@ class Prediction(msgspec.Struct, frozen=True):
     prior : predicted pose and its covariance
     source : what predicts it
     is_guess : whether scans are missing before this one, so that the error may be large
-    scan_motion : that during the last scan
+    scan_motion : that during the last scan, with the rotation during this one where a gyro measures it
     T_odom_last, T_previous_current : pose of the last scan, (d+1, d+1), and its motion since the one before
     interval_s, last_s, usual_s : the interval since the last scan, the one before, the usual one; 0 where unknown
     silence_s : since the last scan by stamps that log times confirm, else 0
@@ -146,9 +149,9 @@ class Prediction(msgspec.Struct, frozen=True):
             return self.scan_motion
         mean = motion / lasted_s
         if not 0.0 < lasted_s < _EVEN * before_s < _EVEN**2 * lasted_s:
-            return ScanMotion(mean)
+            return ScanMotion(mean, self.scan_motion.turning)
         change = mean - lie.log(self.T_previous_current) / before_s
-        return ScanMotion(mean + lasted_s / (lasted_s + before_s) * change)
+        return ScanMotion(mean + lasted_s / (lasted_s + before_s) * change, self.scan_motion.turning)
 
     def deskewing_error(self, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
         """(k,) approximate error of a scan of this duration after deskewing at constant velocity.
@@ -159,7 +162,10 @@ class Prediction(msgspec.Struct, frozen=True):
         if self.lasted_s <= 0.0 or self.is_second:
             return np.zeros(len(self.scan_motion.twist))
         mean = lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.lasted_s
-        return (mean - lie.log(self.T_previous_current) / self.before_s) / self.lasted_s * duration_s**2 / 24.0
+        acceleration = (mean - lie.log(self.T_previous_current) / self.before_s) / self.lasted_s
+        if self.scan_motion.turning is not None:
+            acceleration[len(T_odom_lidar) - 1 :] = 0.0
+        return acceleration * duration_s**2 / 24.0
 
 
 class Predictor:
@@ -177,16 +183,21 @@ class Predictor:
         k = lie.twist_size(T_base_lidar)
         self.scan_motion = ScanMotion(np.zeros(k))
         self.wheels = Wheels(config, T_base_lidar, is_mounted=is_mounted)
-        of_velocity = ErrorStatistics(lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad))
-        self.statistics = {Source.CONSTANT_VELOCITY: of_velocity, Source.WHEELS: self.wheels.statistics}
-        self.filter = MotionFilter(np.diag(of_velocity.first_sigma**2))
+        self.gyro = Gyro(len(T_base_lidar) - 1)
+        sigma = lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad)
+        self.statistics = {Source.WHEELS: self.wheels.statistics}
+        self.statistics |= {source: ErrorStatistics(sigma) for source in Source if not source.is_measured}
+        self.filter = MotionFilter(np.diag(sigma**2))
         self.intervals = Intervals()
         self.lost_s = 0.0
         self.scans, self.doubtful = 0, 0.0  # the latter: share of lost or contradicted scans, 1 after a jump
 
-    def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
-        """The predicted pose of a scan that follows the last one corrected."""
-        times = self.intervals
+    def predict(self, scan: Scan, middle_s: float, *, by_wheels: bool = True) -> Prediction:
+        """The predicted pose of a scan that follows the last one corrected.
+
+        middle_s : seconds from its stamp to its middle, for which the pose is
+        """
+        times, turning = self.intervals, self.gyro.predict(scan, middle_s)
         interval_s = times.to(scan)
         wheel = self.wheels.motion(scan) if by_wheels and times.last_scan is not None else None
         source, is_guess, jump_m = Source.CONSTANT_VELOCITY if wheel is None else Source.WHEELS, False, 0.0
@@ -200,15 +211,21 @@ class Predictor:
             motion = _motion_over(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, is_guess = self.filter.any_motion, True
         else:
+            if turning is not None:
+                source = Source.GYRO
+                self.filter.turn(self.gyro.rotation)
             noise = self.statistics[source].covariance
             motion, covariance = self.filter.motion, self.filter.predicted(noise)[0]
         widest = self.statistics[source].first_sigma
+        if source is Source.GYRO:
+            widest = widest.copy()
+            widest[-self.gyro.size :] = self.gyro.sigma_rad
         T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(
             prior=Prior(T_predicted, covariance, widest, is_measured=source.is_measured),
             source=source,
             is_guess=is_guess,
-            scan_motion=self.scan_motion,
+            scan_motion=ScanMotion(self.scan_motion.twist, turning),
             T_odom_last=self.T_odom_lidar,
             T_previous_current=self.T_previous_current,
             interval_s=interval_s,
@@ -225,6 +242,14 @@ class Predictor:
         """True if most of the last scans were lost or contradicted, or one jumped: they cannot refute wheels."""
         return self.doubtful > _MOST_DOUBTFUL
 
+    def warnings(self) -> tuple[str, ...]:
+        """A line on each defect of wheels and IMU; none without any."""
+        return self.wheels.warnings() + self.gyro.warnings()
+
+    def notes(self) -> tuple[str, ...]:
+        """What was found out about wheels and IMU, a line each."""
+        return tuple(filter(None, (self.wheels.mounting.finish(), self.gyro.note())))
+
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Update by the pose of a scan: that of its match or, if lost, the predicted one."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
@@ -233,6 +258,8 @@ class Predictor:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
             self.scan_motion = prediction.scan_motion_by(lie.log(self.T_previous_current))
             self._update(prediction, match, state)
+        is_known = self.scans > 0 and not scan.clock_jump_s and _shows_rotation(match, state)
+        self.gyro.correct(self.T_previous_current if is_known else None)
         self.scans += 1
         is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)
         self.doubtful += max(1.0 - _MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)
@@ -260,6 +287,13 @@ class Predictor:
             is_independent = not is_measured or match.observability >= WEAK
             if state is State.OK and is_independent and not prediction.is_second:
                 statistics.update(innovation, definite_inverse(match.information).diagonal())
+
+
+def _shows_rotation(match: Match, state: State) -> bool:
+    """True if a scan determines the rotation, at least: its worst direction may be a translation."""
+    turn = match.degeneracy_direction[3 if len(match.T_target_source) == 4 else 2 :]
+    is_open = state is State.DEGENERATE and match.is_fit and float(np.abs(turn).max(initial=0.0)) < _LEAST_TURN
+    return is_open or (state is State.OK and match.converged)
 
 
 def _motion_over(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.config import NO_TRUTH, Config
+from scanchain.config import NO_TOPIC, Config
 from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError, counted
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
@@ -106,7 +106,7 @@ def opened(job: Job, progress: Progress) -> Opened:
     topic = named(job.overrides, "log.ground_truth_topic")
     if truth is not None:
         truth.check(log.expected_stamps(log.topic), log.scan_count)
-    elif topic not in ("", NO_TRUTH):
+    elif topic not in ("", NO_TOPIC):
         if not log.ground_truth_topic:
             raise InputError(f"{log.name}: has no topic {topic}; scanchain info lists those with poses")
         check_overlap(topic, log.expected_stamps(topic), log.expected_stamps(log.topic))

@@ -193,7 +193,12 @@ class _Run:
         if len(self.steps) <= _FEW_SCANS:
             few = f"a trajectory of {counted(len(self.steps), 'scan')}"
             lost.append(f"{few} says nothing about the log; check --start, --end, --every")
-        sensors = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
+        used = {
+            "wheels": log.odometry_topic,
+            "truth": log.ground_truth_topic,
+            "imu": log.imu.topic if log.imu else "",
+        }
+        sensors = other_sensors(log.indexes, **used)
         idle = [f"{each.sensor} {each.topic}: {each.use}" for each in sensors if each.use.startswith("not used")]
         with self.directory.results() as folder:
             truth, note = self.source.accuracy(result, folder)
@@ -201,7 +206,7 @@ class _Run:
                 results, expected and expected.ate, judged, run_s=run_s, compile_s=compile_s,
                 ground_truth=truth, warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
-            notes = [note for note in (self.resumed, *log.notes, result.mounting_note, *idle) if note]
+            notes = [note for note in (self.resumed, *log.notes, *result.sensor_notes, *idle) if note]
             text = summary(metrics, self.source.heading(stopped), self.source.configuration, notes)
             write_figures(folder, metrics, text)
         return metrics, text

@@ -161,7 +161,7 @@ def localize(
                 truth, note = source.accuracy(replace(found.result, trajectory=found.placed), folder)
                 warnings += note
             metrics = measure(found, prior, config, time_s, warnings, truth)
-            text = _summary(metrics, prior, log, found.result.mounting_note)
+            text = _summary(metrics, prior, log, found.result.sensor_notes)
             localized = LocalizedLog(directory.destination, prior, found, metrics, text)
             _write(folder, localized)
             draw(folder, localized)
@@ -360,7 +360,7 @@ def lines_of(m: LocalizeMetrics) -> Iterator[tuple[str, str]]:
     yield from accuracy_lines(m.ground_truth)
 
 
-def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) -> str:
+def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, sensor_notes: tuple[str, ...]) -> str:
     """Text of summary.txt."""
     names = ", ".join(session.name for session in prior.sessions)
     paths, scans = ", ".join(map(str, log.paths)), counted(m.scans, "scan")
@@ -370,7 +370,7 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) 
         *lines_of(m),
         *(("segment", part.text) for part in m.parts),
         *(("warning", warning) for warning in m.warnings),
-        *(("note", note) for note in (*log.notes, mounting_note) if note),
+        *(("note", note) for note in (*log.notes, *sensor_notes)),
         ("time", f"{m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s"),
     ])  # fmt: skip
 

@@ -138,7 +138,7 @@ class Localizer:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about wheel odometry that was rejected."""
-        return self.slam.front_end.odometry.predictor.wheels.warnings()
+        return self.slam.front_end.odometry.predictor.warnings()
 
     def process(self, scan: Scan | Prepared) -> Placed:
         """Localize one scan of a log."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from heapq import merge
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,8 +16,17 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_odometry, pack_transforms, place
+from scanchain.logs.writer import (
+    Link,
+    LogWriter,
+    pack_imu,
+    pack_laser_scan,
+    pack_odometry,
+    pack_transforms,
+    place,
+)
 from scanchain.simulation.another_day import Change, another_day, write_changes
+from scanchain.simulation.imu import IMUS, ImuModel
 from scanchain.simulation.motion import Motion, begun_at, laps, pivots, wheel_odometry
 from scanchain.simulation.sensors import SENSORS, Sensor, Sweep, take_sweep
 from scanchain.simulation.solids import Solids
@@ -24,7 +34,7 @@ from scanchain.simulation.worlds import WORLDS, World
 from scanchain.trajectory import write_tum
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan, in November 2023
-_PLACE, _DEVIATION, _WHEELS, _RANGES = range(4)  # each purpose has random numbers of its own
+_PLACE, _DEVIATION, _WHEELS, _RANGES, _IMU = range(5)  # each purpose has random numbers of its own
 _ODOMETRY_PERIOD_NS = 20_000_000  # 50 Hz, as of most robots' drivers
 _DROPOUT_S = 1.0  # seconds without scans at each of the dropouts of a world
 _PATH_STEP_S = 0.1  # between the positions of a drive that objects keep clear of
@@ -54,6 +64,7 @@ class Drive:
     drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
     solids_of_instant : the solids at the start of a scan, if some of them move
     changes : of the world since the drive of the same seed on the first day
+    imu : None if the vehicle has none
     """
 
     solids: Solids
@@ -67,6 +78,7 @@ class Drive:
     wheels_slip: Slip = NO_SLIP
     solids_of_instant: Callable[[float], Solids] | None = None
     changes: tuple[Change, ...] = ()
+    imu: ImuModel | None = None
 
     def truth(self) -> Trajectory:
         """T_world_lidar at the stamp of every recorded scan: SE(2) for a laser scanner, SE(3) for a lidar."""
@@ -88,10 +100,14 @@ def plan(
     wheels_slip: Slip = NO_SLIP,
     reverse: bool = False,
     start_m: float = 0.0,
+    pace: float = 1.0,
+    imu: str | None = None,
 ) -> Drive:
     """The drive that ``simulate`` records for the same arguments."""
     if world not in WORLDS:
         raise InputError(f"world {world!r} does not exist; choose one of {', '.join(WORLDS)}")
+    if imu is not None and imu not in IMUS:
+        raise InputError(f"IMU {imu!r} does not exist; choose one of {', '.join(IMUS)}")
     scene = WORLDS[world]
     lidar = _sensor(sensor or scene.sensor, noise_m, dropout, scene.sight_m)
     length_s = scene.duration_s if duration_s is None else duration_s
@@ -99,6 +115,7 @@ def plan(
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
     _check_range("start_m", start_m, 0.0, checks.LARGEST)
     _check_range("drift", drift, 0.0, 100.0)
+    _check_range("pace", pace, 0.1, 10.0)
     start_s, end_s, size_m = wheels_slip
     if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
         raise InputError(
@@ -106,7 +123,7 @@ def plan(
             "after that"
         )
     solids = scene.build(_random(seed, _PLACE))
-    driven_s = length_s + lidar.period_ns * 1e-9
+    driven_s = pace * (length_s + lidar.period_ns * 1e-9)
     if isinstance(scene.route, tuple):
         if reverse or start_m:
             raise InputError(f"{world} has no closed route; leave out reverse and start_m")
@@ -114,7 +131,7 @@ def plan(
     else:
         route = begun_at(scene.route[::-1] if reverse else scene.route, start_m)
         moving = partial(laps, route, scene.vehicle, solids, duration_s=driven_s)
-    motion = moving(rng=_random(seed, _DEVIATION, changed))
+    motion = moving(rng=_random(seed, _DEVIATION, changed)).at_pace(pace)
     changes: tuple[Change, ...] = ()
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
@@ -125,7 +142,7 @@ def plan(
     scans = _recorded(scene, motion, lidar, count)
     return Drive(
         solids, motion, lidar, scene.vehicle.T_base_lidar, scans, seed, changed, drift, wheels_slip,
-        changes=changes,
+        changes=changes, imu=None if imu is None else IMUS[imu],
     )  # fmt: skip
 
 
@@ -187,14 +204,16 @@ def simulate(
     A scan's stamp is the instant of its first ray, point times are relative to it, and it is logged at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, only /odom continues.
+    With an IMU it also holds /imu/data (200 Hz, frame imu_link) and T_base_imu in /tf_static.
 
     force : whether existing files are replaced
     progress : called with the number of scans done and the total
     options : ``seed``, 0 by default; ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in
         place of the sensor's own; ``drift``, which multiplies the errors of the wheel odometry, and
-        ``wheels_slip``, by which it slips once; ``reverse`` to drive in the opposite direction, from ``start_m``
-        along that route; ``changed``, a seed, for another day: furniture or parked cars appeared, vanished or
-        moved, as listed in .changes.csv next to the log, and the drive is repeated with other deviations and noise
+        ``wheels_slip``, by which it slips once; ``imu``, by name; ``pace``, a factor on the speed of the drive;
+        ``reverse`` to drive in the opposite direction, from ``start_m`` along that route; ``changed``, a seed, for
+        another day: furniture or parked cars appeared, vanished or moved, as listed in .changes.csv next to the
+        log, and the drive is repeated with other deviations and noise
 
     Returns the ground truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
@@ -217,15 +236,17 @@ def record(
     truth = drive.truth()
     period_ns = drive.sensor.period_ns
     with LogWriter(destination, force=force) as log:
-        mounting = pack_transforms(EPOCH_NS, Link("base_link", "lidar", place(drive.T_base_lidar)))
-        log.append("/tf_static", "tf2_msgs/msg/TFMessage", mounting, EPOCH_NS)
-        wheels = _Wheels(log, drive, int(truth.stamps_ns[-1]) + period_ns)
+        links = [Link("base_link", "lidar", place(drive.T_base_lidar))]
+        if drive.imu is not None and drive.imu.is_transform_known:
+            links.append(Link("base_link", "imu_link", place(drive.imu.T_base_imu)))
+        log.append("/tf_static", "tf2_msgs/msg/TFMessage", pack_transforms(EPOCH_NS, *links), EPOCH_NS)
+        others = _OtherSensors(log, drive, int(truth.stamps_ns[-1]) + period_ns)
         for done, sweep in enumerate(_sweeps(drive)):
             stamp_ns = int(truth.stamps_ns[done])
-            wheels.write_until(stamp_ns - 1)  # in a dropout
+            others.write_until(stamp_ns - 1)  # in a dropout
             pose = pack_odometry(stamp_ns, "world", "lidar", place(truth.poses[done]))
             log.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
-            wheels.write_until(stamp_ns + period_ns)
+            others.write_until(stamp_ns + period_ns)
             _write_sweep(log, sweep, drive.sensor, stamp_ns)
             if progress is not None:
                 progress(done + 1, len(truth))
@@ -253,25 +274,50 @@ def _sweeps(drive: Drive) -> Iterator[Sweep]:
         yield upcoming.result()
 
 
-class _Wheels:
+class _Message(NamedTuple):
+    stamp_ns: int
+    topic: str
+    schema: str
+    data: bytes
+
+
+class _OtherSensors:
+    """Messages of the wheels and the IMU until the stamp ``last_ns``, written in the order of their stamps."""
+
     def __init__(self, log: LogWriter, drive: Drive, last_ns: int) -> None:
         self._log = log
-        self._stamps_ns = np.arange(EPOCH_NS, last_ns + 1, _ODOMETRY_PERIOD_NS)
-        times_s = (self._stamps_ns - EPOCH_NS) * 1e-9
-        begin_s, end_s, size_m = drive.wheels_slip
-        slips_m = np.diff(size_m * np.clip((times_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
-        poses, rng = drive.motion.base(times_s), _random(drive.seed, _WHEELS, drive.changed)
-        self._poses = wheel_odometry(poses, drift=drive.drift, rng=rng, slips_m=slips_m)
-        self._covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drive.drift, 1e-3) ** 2
-        self._next = 0
+        sources = [_wheels(drive, last_ns)]
+        if drive.imu is not None:
+            sources.append(_imu(drive, drive.imu, last_ns))
+        self._messages = merge(*sources, key=lambda message: message.stamp_ns)
+        self._next = next(self._messages, None)
 
     def write_until(self, time_ns: int) -> None:
-        while self._next < len(self._stamps_ns) and self._stamps_ns[self._next] <= time_ns:
-            stamp_ns = int(self._stamps_ns[self._next])
-            pose = place(self._poses[self._next])
-            data = pack_odometry(stamp_ns, "odom", "base_link", pose, self._covariance)
-            self._log.append("/odom", "nav_msgs/msg/Odometry", data, stamp_ns)
-            self._next += 1
+        while self._next is not None and self._next.stamp_ns <= time_ns:
+            stamp_ns, topic, schema, data = self._next
+            self._log.append(topic, schema, data, stamp_ns)
+            self._next = next(self._messages, None)
+
+
+def _wheels(drive: Drive, last_ns: int) -> Iterator[_Message]:
+    stamps_ns = np.arange(EPOCH_NS, last_ns + 1, _ODOMETRY_PERIOD_NS)
+    times_s = (stamps_ns - EPOCH_NS) * 1e-9
+    begin_s, end_s, size_m = drive.wheels_slip
+    slips_m = np.diff(size_m * np.clip((times_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
+    poses, rng = drive.motion.base(times_s), _random(drive.seed, _WHEELS, drive.changed)
+    poses = wheel_odometry(poses, drift=drive.drift, rng=rng, slips_m=slips_m)
+    covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drive.drift, 1e-3) ** 2
+    for stamp_ns, pose in zip(stamps_ns.tolist(), poses, strict=True):
+        data = pack_odometry(stamp_ns, "odom", "base_link", place(pose), covariance)
+        yield _Message(stamp_ns, "/odom", "nav_msgs/msg/Odometry", data)
+
+
+def _imu(drive: Drive, imu: ImuModel, last_ns: int) -> Iterator[_Message]:
+    stamps_ns = np.arange(EPOCH_NS, last_ns + 1, imu.period_ns)
+    instants_s = (stamps_ns - EPOCH_NS - imu.delay_ns) * 1e-9
+    samples = imu.measure(drive.motion, instants_s, _random(drive.seed, _IMU, drive.changed))
+    for stamp_ns, *vectors in zip(stamps_ns.tolist(), *(values.tolist() for values in samples), strict=True):
+        yield _Message(stamp_ns, "/imu/data", "sensor_msgs/msg/Imu", pack_imu(stamp_ns, "imu_link", *vectors))
 
 
 def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) -> None:

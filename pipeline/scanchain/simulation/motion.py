@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -96,6 +96,15 @@ class Motion:
             twists[:, [2, 3, 4, 1, 5]] = (speed_m_s / v.speed_m_s)[:, None] * sizes * waves
             poses = poses @ lie.exp(twists)
         return poses
+
+    def at_pace(self, pace: float) -> Motion:
+        """The same course, driven ``pace`` times as fast."""
+
+        def course(times_s: NDArray[np.floating]) -> Course:
+            place, forward, speed_m_s = self.course(pace * times_s)
+            return Course(place, forward, pace * speed_m_s)
+
+        return replace(self, course=course, vehicle=replace(self.vehicle, speed_m_s=pace * self.vehicle.speed_m_s))
 
     def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_lidar at (N,) instants, (N, 4, 4)."""

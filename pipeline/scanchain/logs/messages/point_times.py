@@ -132,6 +132,11 @@ class Returns(NamedTuple):
     frame: str = ""
     stated: Field | Beams | None = None
 
+    @property
+    def end_ns(self) -> int:
+        """Stamp of its last point."""
+        return self.stamp_ns + (round(1e9 * float(self.times_s.max())) if len(self.times_s) else 0)
+
     def seconds(self, unit: str) -> NDArray[np.float32]:
         """Stated times (N,) after the stamp in this unit; (0,) if there are none or they are constant."""
         if isinstance(self.stated, Beams):
