@@ -61,7 +61,8 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     """Reading of the log.
 
     format : log format: found automatically, a known one by name, or ``module:Class`` of your own
-    topic : lidar topic; found automatically where empty
+    topic : lidar topic; found automatically where empty; several, separated by commas, combine lidars: the points
+        of the others are added to the scans of the first, in its frame
     odometry_topic : wheel odometry, ``nav_msgs/Odometry``, stamped poses, or transforms with odom → base_link;
         found automatically where empty
     ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused

@@ -62,11 +62,13 @@ class OtherPoints(NamedTuple):
 
     times_s : (N,) seconds after the scan's stamp
     origin : (d,) meters
+    moves_middle : whether the middle of the scan, where it is aligned, is that of these points too
     """
 
     points: RawPoints
     times_s: NDArray[np.float32]
     origin: Vector
+    moves_middle: bool = True
 
 
 class RaySpan(NamedTuple):

@@ -97,6 +97,11 @@ class Sweep:
     spans: tuple[RaySpan, ...] = ()
 
     @property
+    def own(self) -> int:
+        """Number of points of the scan's own lidar, which are the first ones."""
+        return self.spans[0].rays if self.spans else len(self.points)
+
+    @property
     def is_distorted(self) -> bool:
         """True if the points are distorted by the lidar's motion."""
         return len(self.times_s) > 0
@@ -137,16 +142,21 @@ def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
     spans: tuple[RaySpan, ...] = ()
     if scan.others or scan.origin is not None:
         origin = np.zeros(raw.shape[1]) if scan.origin is None else scan.origin
-        spans = tuple(RaySpan(each, len(points)) for points, _, each in ((raw, times_s, origin), *scan.others))
+        spans = RaySpan(origin, len(raw)), *(RaySpan(each.origin, len(each.points)) for each in scan.others)
+    of_middle = times_s
     if scan.others:
         times_s = times_s if len(times_s) else np.zeros(len(raw), np.float32)
+        of_middle = np.concatenate([times_s, *(each.times_s for each in scan.others if each.moves_middle)])
         raw = np.concatenate([raw, *(each.points for each in scan.others)])
         times_s = np.concatenate([times_s, *(each.times_s for each in scan.others)])
     chosen = first_per_voxel(raw, voxel_m, config.min_range_m, config.max_range_m)
+    if kept := RaySpan.among(spans, chosen):  # of others: not the robot around them
+        origins = np.repeat([span.origin for span in kept], [span.rays for span in kept], axis=0)
+        chosen = chosen[np.linalg.norm(raw[chosen] - origins, axis=1) >= config.min_range_m]
     points, spans = raw.take(chosen, axis=0).astype(np.float64), RaySpan.among(spans, chosen)
     if not len(times_s):
         return Sweep(points, np.empty(0), 0.0, spans)
-    middle_s = 0.5 * (float(times_s.min()) + float(times_s.max()))
+    middle_s = 0.5 * (float(of_middle.min()) + float(of_middle.max()))
     return Sweep(points, times_s[chosen].astype(np.float64) - middle_s, middle_s, spans)
 
 

@@ -44,10 +44,9 @@ def overrides_of(values: Mapping[str, object], section: str = "") -> tuple[Overr
     section : that of the keys, if the arguments do not name it
     """
     named = {f"{section}.{name}" if section else name.replace("__", "."): value for name, value in values.items()}
-    return tuple(
-        Override(key, str(value).lower() if isinstance(value, bool) else str(value), f"--{key}")
-        for key, value in named.items()
-    )
+    texts = {key: ",".join(map(str, value)) for key, value in named.items() if isinstance(value, list | tuple)}
+    texts |= {key: str(value).lower() for key, value in named.items() if isinstance(value, bool)}
+    return tuple(Override(key, texts.get(key, str(value)), f"--{key}") for key, value in named.items())
 
 
 def named(overrides: Sequence[Override], key: str) -> str:

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from scanchain import lie
+from scanchain.data import RaySpan
 from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.odometry.elevation import Adjusting, ElevationCalibration, _combined, raised
+from scanchain.preprocess import Sweep
 from scanchain.trajectory import read_tum
 from tests.support import made, naive
 from tests.support.scenes import configured, kitti_scans, shared_data
@@ -74,6 +76,17 @@ def test_points_are_raised_by_their_elevation_alone():
     azimuth = [np.arctan2(each[:, 1], each[:, 0]) for each in (points, moved)]
     assert np.allclose(elevation[1] - elevation[0], 0.01) and np.allclose(*azimuth)
     assert np.allclose(np.linalg.norm(points, axis=1), np.linalg.norm(moved, axis=1))
+
+
+def test_only_the_points_of_the_scans_own_lidar_are_raised():
+    points, calibration = (
+        np.random.default_rng(0).uniform(-9.0, 9.0, (30, 3)),
+        ElevationCalibration(is_wanted=True),
+    )
+    calibration.offset_rad = 0.004
+    spans = RaySpan(np.zeros(3), 20), RaySpan(np.ones(3), 10)
+    corrected = calibration.corrected(Sweep(points, np.empty(0), 0.0, spans)).points
+    np.testing.assert_array_equal(corrected, [*raised(points[:20], 0.004), *points[20:]])
 
 
 def test_points_in_planes_are_those_of_flat_cells_that_three_scans_see():

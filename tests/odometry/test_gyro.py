@@ -6,8 +6,10 @@ from scipy.spatial.transform import Rotation
 
 import scanchain
 from scanchain import lie
+from scanchain.config import PreprocessConfig
 from scanchain.data import Inertial, Scan
 from scanchain.odometry.gyro import Gyro
+from scanchain.preprocess import sweep_of
 from tests.benchmarks.imu import driven
 from tests.support import made
 
@@ -45,10 +47,10 @@ def drive(gyro, scans=80, *, late_s=0.0, axes=ALIGNED, stated=ALIGNED, limit=np.
         rates = np.clip(rates + BIAS + 0.001 * random.normal(size=rates.shape), -limit, limit) @ axes
         stamps_ns = np.round(1e9 * stamps_s).astype(np.int64) + 10**18
         inertial = Inertial(stamps_ns, rates, np.zeros_like(rates), stated)
-        points, times_s = np.ones((2, dimension)), np.array([0.0, SCAN_S])
+        points, times_s = 5.0 * np.array([np.ones(dimension), -np.ones(dimension)]), np.array([0.0, SCAN_S])
         scan = Scan.of(points, 1e9 + stamp_s, times_s, index=k, inertial=inertial)
         gyro.add(scan)
-        gyro.predict(scan, 0.5 * SCAN_S)
+        gyro.predict(scan, sweep_of(scan, PreprocessConfig()))
         if not k:
             gyro.correct(None)
             continue
@@ -125,7 +127,7 @@ def test_without_samples_for_long_there_is_no_rotation():
     gyro = Gyro(3)
     drive(gyro, scans=12)
     scan = Scan.of(np.ones((2, 3)), 1e9 + 2.0, np.array([0.0, SCAN_S]), index=12)
-    assert gyro.predict(scan, 0.5 * SCAN_S) is None
+    assert gyro.predict(scan, sweep_of(scan, PreprocessConfig())) is None
     assert any("no sample" in line for line in gyro.warnings())
 
 

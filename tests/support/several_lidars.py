@@ -66,3 +66,18 @@ def recorded(log):
     """All messages of a log as they are."""
     decoders = dict.fromkeys(topics_of(log.indexes), bytes)
     return stream.decoded_messages(log.indexes, decoders, stream.EVERYTHING, damage=[])
+
+
+def on_own_topics(source, path):
+    """A log of several publishers on one topic with a topic for each, named after its frame."""
+    log = open_log(source)
+    with LogWriter(path) as writer:
+        for message in recorded(log):
+            if message.channel.topic == log.topic:
+                head = reader(log.lidar)(memoryview(message.value)).message.header
+                stamp_ns = head.stamp.sec * SECOND + head.stamp.nanosec
+                name = "sensor_msgs/msg/LaserScan"
+                writer.append(f"/{head.frame_id}", name, message.value, stamp_ns, message.log_time_ns)
+            else:
+                writer.copy(message.channel, message.log_time_ns, message.value)
+    return path

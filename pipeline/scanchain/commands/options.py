@@ -80,7 +80,8 @@ class OverrideCommand(click.Command):
 def key(flag: str, name: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
     """An option that sets a configuration key; with ``value``, a flag without argument that sets this value."""
 
-    def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
+    def keep(ctx: click.Context, _: click.Parameter, given: str | bool | tuple[str, ...] | None) -> None:
+        given = (",".join(given) or None) if isinstance(given, tuple) else given  # a tuple if ``multiple``
         if given not in (None, False):
             ctx.meta.setdefault(_ALIASES, []).append(Override(name, value or str(given), flag))
 
@@ -102,9 +103,10 @@ def part(log: str = "the log", *, topic: str = "the only one that fits") -> Call
     log, topic : in words, the log that is cut, and the lidar topic used without ``--topic``
     """
     of = "" if log == "the log" else f" of {log}"
+    topics = f"Lidar topic{of}; several are combined, in the frame of the first. [default: {topic}]"
     begin = f"Skip {log} up to this time, counted from its first message."
     return _together(
-        key("--topic", "log.topic", metavar="TOPIC", help=f"Lidar topic{of}. [default: {topic}]"),
+        key("--topic", "log.topic", metavar="TOPIC", multiple=True, help=topics),
         key("--start", "log.start_s", metavar="SECONDS", help=begin),
         key("--end", "log.end_s", metavar="SECONDS", help=f"Skip {log} after this time."),
         key("--every", "log.every", metavar="N", help="Take every N-th scan."),

@@ -17,7 +17,7 @@ from scanchain.logs.index import Decoded, FileIndex, name_of
 from scanchain.logs.log import Log
 from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.opening import AUTO, index_files
-from scanchain.logs.topics import find_lidar, topics_of
+from scanchain.logs.topics import find_lidars, topics_of
 from scanchain.logs.writer import LogWriter
 
 _DEFAULTS = LogConfig()
@@ -58,10 +58,8 @@ def convert(
     if len(indexes) == 1 and is_mcap and not is_folder and not is_part:
         raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)
-    lidar, channels = find_lidar(indexes, config.topic) if config.topic else None, topics_of(indexes)
-    others = (
-        [] if lidar is None else [name for name in channels if name != lidar.topic and is_lidar(channels[name])]
-    )
+    lidars, channels = find_lidars(indexes, config.topic) if config.topic else [], topics_of(indexes)
+    others = [name for name in channels if lidars and is_lidar(channels[name]) and channels[name] not in lidars]
     counts = {name: 0 for name in channels if name not in others}
     for topic in counts:
         if config.every > 1 and is_lidar(channels[topic]) and Log(indexes, replace(config, topic=topic)).sectors:

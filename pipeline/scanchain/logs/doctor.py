@@ -98,7 +98,7 @@ def examine(
         severity = Severity.WARNING if effect else Severity.OK
         found.append(Finding("distortion", severity, measured[0], effect, measured[1]))
     ordered = tuple(finding for grade in reversed(Severity) for finding in found if finding.severity is grade)
-    return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, ordered, notes)
+    return Diagnosis(tuple(map(str, log.paths)), log.topics, log.dimension, ordered, notes)
 
 
 class Facts(NamedTuple):
@@ -159,6 +159,10 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
     yield _stamps(seen)
     yield _wheels(seen)
+    if seen.log.others:
+        found, grade = "; ".join(seen.log.together.absences()), Severity.WARNING
+        usual = Finding("lidars", Severity.OK, f"{seen.log.topics} are used together")
+        yield Finding("lidars", grade, found, "other scans are matched with all lidars") if found else usual
     yield _point_times(seen)
     yield _damage(seen, config.preprocess, most_bad)
     yield _returns(seen)

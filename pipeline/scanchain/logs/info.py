@@ -41,7 +41,7 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
         "start_ns": whole.begin_ns,
         "duration_s": whole.duration_s,
         "topics": [_topic(indexes, topic, whole.duration_s) for topic in topics_of(indexes)],
-        "lidar": log.topic if log else "",
+        "lidar": log.topics if log else "",
         "dimension": log.dimension if log else 0,
         "scans": log.scan_count if log else 0,
         "odometry": log.odometry_topic if log else wheels,

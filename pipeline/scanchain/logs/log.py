@@ -22,10 +22,10 @@ from scanchain.files import Source, source_of
 from scanchain.logs import stream
 from scanchain.logs.bad_scans import ScanCounts, defect
 from scanchain.logs.index import Channel, Decoded, FileIndex, name_of
-from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
+from scanchain.logs.messages.lidar import Returns, plane_height_m
 from scanchain.logs.messages.point_times import UNTIMED, PointTimes
 from scanchain.logs.messages.poses import StampedPose
-from scanchain.logs.messages.readers import Read, is_scan, pose_reader, reader
+from scanchain.logs.messages.readers import Read, is_scan, pose_reader
 from scanchain.logs.mounting import (
     Wheels,
     between_frames,
@@ -36,10 +36,11 @@ from scanchain.logs.mounting import (
     is_upside_down,
 )
 from scanchain.logs.opening import index_files
+from scanchain.logs.other_lidars import OtherLidar, Together, decoder
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
 from scanchain.logs.samples import NEAREST_NS, Recorded
 from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sectors
-from scanchain.logs.topics import find_ground_truth, find_lidar
+from scanchain.logs.topics import find_ground_truth, find_lidars
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
@@ -51,7 +52,8 @@ def open_log(
 ) -> Log:
     """Log of one file, folder or address, or of several, opened and its topics chosen.
 
-    changes : keys of ``[log]`` on top of ``config``, such as topic="/lidar_front/points" or end_s=60.0
+    changes : keys of ``[log]`` on top of ``config``, such as topic="/lidar_front/points" or end_s=60.0;
+        topic=("/front", "/rear") combines lidars
     Raises InputError if it is no log, or for an unknown key.
     """
     named = sources_of(sources)
@@ -81,6 +83,7 @@ class Log:
 
     paths, name : its files, and their names for errors
     topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for other clouds
+    others : the lidars on other topics whose points are added to its scans; topics : of all, separated by commas
     mounting : of the lidar on the robot, with T_base_lidar (d+1, d+1); stated_mounting : None if it is assumed
     scan_count : number of scans by the index, for the chosen part and ``every``
     duration_s : time from the first to the last message
@@ -94,17 +97,19 @@ class Log:
     Set by reading, once ``scans`` is exhausted or closed:
     bad_scans, scans_with_wheels : number of scans left out, and with a wheel reading near their stamp
     times : reader of the point times; jumps : warnings about jumps or a wrong rate of the header stamps
+    together : the other lidars
     """
 
+    together: Together
     _truth: Trajectory | None
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
         self.config, self.indexes = config, indexes
-        self.paths = tuple(index.path for index in indexes)
-        self.name = name_of(indexes)
+        self.paths, self.name = tuple(index.path for index in indexes), name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         stream.check_one_log(indexes, config)
-        self.lidar = lidar = find_lidar(indexes, config.topic)
+        lidar, *others = find_lidars(indexes, config.topic)
+        self.lidar, self.topics = lidar, ", ".join(each.topic for each in (lidar, *others))
         self.topic, truth = lidar.topic, find_ground_truth(indexes, config.ground_truth_topic)
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = self.times = PointTimes(config)
@@ -125,6 +130,7 @@ class Log:
         self.publishers = Publishers(
             of_part, partial(between_frames, indexes, self.span), is_planar=self.dimension == 2
         )
+        self.others = [OtherLidar(indexes, each, config, self.publishers, self.notes) for each in others]
         wheels = find_wheels(indexes, self.publishers.frame, config, self.span, self.notes)
         self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # the notes on long gaps
@@ -144,9 +150,8 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         self.imu = find_imu(indexes, config.imu_topic, self.publishers.frame, self.span, self.notes)
         self.sample_decoders = self._sample_decoders(wheels, truth)
-        self.scans_with_wheels, self.bad_scans, self.distorted_share = 0, 0, 0.0
-        self.distortion, self.jumps, self._truth = "", list[str](), None
-        self._opening_notes = tuple(self.notes)
+        self.scans_with_wheels, self.bad_scans, self.distorted_share, self.distortion = 0, 0, 0.0, ""
+        self.jumps, self._truth, self._opening_notes = list[str](), None, tuple(self.notes)
 
     def __repr__(self) -> str:
         return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"
@@ -194,12 +199,12 @@ class Log:
         recorded = Recorded(self.odometry_topic, self.ground_truth_topic, self.imu, is_mirrored=self.is_mirrored)
         counts = ScanCounts(self.topic, self.odometry_topic)
         self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
+        self.together = Together(self.topic, self.others, self.publishers, is_mirrored=self.is_mirrored)
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic, self.times)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
             for message, T_odom_base, jumped_s in with_jumps(self._with_samples(counts, recorded, assembler)):
-                count += 1
-                jump_s = jumped_s or jump_s
+                count, jump_s = count + 1, jumped_s or jump_s
                 if (count - 1) % self.config.every:
                     continue
                 if unusable := defect(message, preprocess):
@@ -227,17 +232,17 @@ class Log:
                 counts.add(scan)
                 self.scans_with_wheels += T_odom_base is not None
                 yield scan
-                index, jump_s = index + 1, 0.0
-                requested_s = working_s()
+                index, jump_s, requested_s = index + 1, 0.0, working_s()
             self._truth = recorded.ground_truth(self._lidar_on)
         finally:  # also if the caller stops early
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
-            self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *recorded.losses()]
+            lost = [*recorded.losses(), *self.together.losses()]
+            self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *lost]
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
             is_said = any(note.startswith(UNTIMED.partition(":")[0]) for note in self._opening_notes)
             assumed = "" if is_said and self.times.assumed == UNTIMED else self.times.assumed
-            self.notes += [*filter(None, [assumed]), *self.times.faults(self.topic)]
-            self.notes += counts.notes() + (assembler.notes() if assembler else []) + recorded.notes()
+            self.notes += [*filter(None, [assumed]), *self.times.faults(self.topic), *counts.notes()]
+            self.notes += (assembler.notes() if assembler else []) + recorded.notes() + self.together.notes()
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -323,11 +328,11 @@ class Log:
         self, counts: ScanCounts, recorded: Recorded, assembler: Assembler | None
     ) -> Iterator[tuple[Decoded, Pose | None]]:
         """Scans with the wheel odometry pose at their stamp; they are held back briefly for samples after them."""
-        decoders = {self.topic: self.decoder(self.times), **self.sample_decoders}
+        decoders = {self.topic: self.decoder(self.times), **self.together.decoders, **self.sample_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
         messages = messages if assembler is None else assembler.sweeps(messages)
-        for message in chain(self.times.checked(messages, self.topic), [None]):
+        for message in chain(self.together.joined(self.times.checked(messages, self.topic)), [None]):
             if message is not None and message.channel.topic == self.topic:
                 value = message.value
                 if not isinstance(value, Returns) or counts.uses(self.publishers.of(value.frame), value):
@@ -347,9 +352,7 @@ class Log:
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` records what is assumed about the point times."""
-        if is_scan(self.lidar):
-            return partial(decode_laser_scan, read=reader(self.lidar), config=times.config)
-        return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
+        return decoder(self.lidar, times, self.plane_height_m)
 
     def _point_times(self) -> PointTimes:
         """New reader of point times; if messages are sectors, in the unit inferred from their duration."""

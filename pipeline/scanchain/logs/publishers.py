@@ -69,16 +69,21 @@ class Publishers:
             self.known[frame] = self._further(frame, f"frame {frame or 'without a name'}")
         return self.known[frame]
 
-    def _further(self, frame: str, name: str) -> Publisher:
-        T, away_ns = self.between(self.frame, frame), self._away_ns(frame)
+    def joined(self, frame: str, away_ns: float) -> tuple[Pose, str]:
+        """T_first_frame of a frame, and why its points cannot be moved by it; empty if they can."""
+        T = self.between(self.frame, frame) if frame != self.frame else np.eye(4)
         if abs(away_ns) > _STEP_NS:
             side = "ahead of" if away_ns > 0 else "behind"
-            why = f"its clock is {duration(1e-9 * abs(away_ns))} {side} that of frame {self.frame}"
-        elif T is None:
-            why = f"no static transform leads to frame {self.frame}"
-        elif self.is_planar and tilt_rad(T) > TILTED_RAD:
-            why = f"its plane is tilted by {np.degrees(tilt_rad(T)):.0f} deg against frame {self.frame}"
-        else:
+            return np.eye(4), f"its clock is {duration(1e-9 * abs(away_ns))} {side} that of frame {self.frame}"
+        if T is None:
+            return np.eye(4), f"no static transform leads to frame {self.frame}"
+        if not self.is_planar or tilt_rad(T) <= TILTED_RAD:
+            return T, ""
+        return T, f"its plane is tilted by {np.degrees(tilt_rad(T)):.0f} deg against frame {self.frame}"
+
+    def _further(self, frame: str, name: str) -> Publisher:
+        T, why = self.joined(frame, self._away_ns(frame))
+        if not why:
             note = f"scans of {name} are moved to frame {self.frame}: by the transforms it is at {place_text(T)}"
             return Publisher(frame, T, note)
         why = f"a second publisher of scans, {name}, is left out: {why}; record each on a topic of its own"
@@ -99,21 +104,27 @@ def seen_together(
 
     latest : header stamp and points of the last scan of each frame; updated
     """
-    T, d = publishers.of(returns.frame).T_first_frame, returns.points.shape[1]
-    points, origin = moved(returns.points, T), np.zeros(d) if T is None else T[:d, -1]
-    if is_mirrored:
-        points, origin = points * np.array([1.0, -1.0], np.float32), origin * [1.0, -1.0]
-    own = OtherPoints(points, returns.times_s, origin)
+    own = in_first_frame(returns, publishers.of(returns.frame).T_first_frame, is_mirrored=is_mirrored)
     if len(publishers.known) < 2:
-        return own, ()
+        return own, returns.others
     near = tuple(
         other._replace(times_s=other.times_s + np.float32(1e-9 * (other_ns - returns.stamp_ns)))
         for frame, (other_ns, other) in latest.items()
         if frame != returns.frame and 0 <= returns.stamp_ns - other_ns <= _TOGETHER_NS
     )
-    times_s = returns.times_s if len(returns.times_s) else np.zeros(len(points), np.float32)
+    times_s = returns.times_s if len(returns.times_s) else np.zeros(len(own.points), np.float32)
     latest[returns.frame] = returns.stamp_ns, own._replace(times_s=times_s)
-    return own, near
+    return own, (*near, *returns.others)
+
+
+def in_first_frame(returns: Returns, T_first_frame: Pose | None, *, is_mirrored: bool) -> OtherPoints:
+    """Points of a message in the first publisher's frame, their times, and where its lidar is there."""
+    d = returns.points.shape[1]
+    points = moved(returns.points, T_first_frame)
+    origin = np.zeros(d) if T_first_frame is None else T_first_frame[:d, -1]
+    if is_mirrored:
+        points, origin = points * np.array([1.0, -1.0], np.float32), origin * [1.0, -1.0]
+    return OtherPoints(points, returns.times_s, origin)
 
 
 def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tuple[Decoded, Pose | None, float]]:

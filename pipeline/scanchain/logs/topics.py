@@ -26,8 +26,13 @@ def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
     return dict(sorted(channels.items()))
 
 
-def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
-    """The lidar's channel: the configured topic, else the only lidar's. Raises InputError without a unique one."""
+def find_lidars(indexes: Sequence[FileIndex], wanted: str) -> list[Channel]:
+    """The lidars' channels: of the configured topics, else of the only lidar. Raises InputError if not unique."""
+    topics = [wanted] if wanted in topics_of(indexes) else [topic.strip() for topic in wanted.split(",")]
+    return [_lidar(indexes, topic) for topic in dict.fromkeys(topics)]
+
+
+def _lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     channels = topics_of(indexes)
     name = name_of(indexes)
     lidars = [channel for channel in channels.values() if is_lidar(channel)]
@@ -44,7 +49,10 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
         is_other = f"topic {_listed([channels[wanted]])} is not of a lidar" if wanted in channels else ""
         why = is_other or f"has no topic {wanted}"
         raise InputError(f"{name}: {why}; choose --topic from: {_listed(lidars)}")
-    raise InputError(f"{name}: has several lidar topics; choose one with --topic: {_listed(lidars, indexes)}")
+    raise InputError(
+        f"{name}: has several lidar topics; choose one with --topic, or several, which are then combined: "
+        f"{_listed(lidars, indexes)}"
+    )
 
 
 def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[str]) -> Channel | None:

@@ -57,8 +57,11 @@ class ElevationCalibration:
         self.reset()
 
     def corrected(self, sweep: Sweep) -> Sweep:
-        """The sweep with its points raised by the offset."""
-        return replace(sweep, points=raised(sweep.points, self.offset_rad)) if self.offset_rad else sweep
+        """The sweep with the points of its own lidar raised by the offset."""
+        if not self.offset_rad:
+            return sweep
+        points, own = sweep.points, sweep.own
+        return replace(sweep, points=np.concatenate([raised(points[:own], self.offset_rad), points[own:]]))
 
     def reset(self) -> None:
         """Discard the collected scans: the next pose is not connected to theirs."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.data import Mask, Matrix, Pose, Scan, Vector
 from scanchain.errors import counted
-from scanchain.preprocess import ScanMotion, Turning
+from scanchain.preprocess import ScanMotion, Sweep, Turning
 
 _SCANS = 200  # motions between scans in memory, from which the model is estimated
 _FIRST_FIT, _FITS = 10, 1.5  # number of motions at the first estimate, and factor to that at the next one
@@ -101,13 +101,10 @@ class Gyro:
             self.stated = found.R_lidar_imu[-self.size :]
             self.model = Model(self.stated, np.zeros(self.size))
 
-    def predict(self, scan: Scan, middle_s: float) -> Turning | None:
-        """Rotation around the middle of a scan, from that of the last one to the end of this; None if not used.
-
-        middle_s : seconds from the stamp of the scan to its middle
-        """
-        self.now_s = (scan.stamp_ns - self.origin_ns) * 1e-9 + middle_s
-        self.turning = self._measured(scan, middle_s)
+    def predict(self, scan: Scan, sweep: Sweep) -> Turning | None:
+        """Rotation from the middle of the last scan to the end of this one; None if it is not used."""
+        self.now_s = (scan.stamp_ns - self.origin_ns) * 1e-9 + sweep.middle_s
+        self.turning = self._measured(float(np.abs(sweep.times_s).max(initial=0.0)))
         if self.turning is not None:
             still = np.zeros(3 if self.size == 1 else 6)
             self.rotation = -lie.log(ScanMotion(still, self.turning).over(self.last_s - self.now_s))[-self.size :]
@@ -147,11 +144,10 @@ class Gyro:
             lines.append("it is not used, since it predicts no rotation better than the scans do")
         return tuple(f"IMU: {line}" for line in lines)
 
-    def _measured(self, scan: Scan, middle_s: float) -> Turning | None:
-        """Rotation around the middle of a scan."""
+    def _measured(self, half_s: float) -> Turning | None:
+        """Rotation from the middle of the last scan to half a duration after that of this one."""
         if self.model is None or not self.blocks or math.isnan(self.last_s):
             return None
-        half_s = float(np.abs(scan.times_s - middle_s).max()) if len(scan.times_s) else 0.0
         delay_s = self.model.delay_s
         begin_s, end_s = min(self.last_s, self.now_s - half_s) + delay_s, self.now_s + half_s + delay_s
         times_s, rates = self._samples(begin_s)

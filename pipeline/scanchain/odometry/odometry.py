@@ -161,7 +161,7 @@ class Odometry:
         self.predictor.correct(scan, registered.prediction, registered.match, registered.state)
         points = sweep.from_middle(self.predictor.scan_motion)
         self._extend(points, registered)
-        self._calibrate(points, registered.state)
+        self._calibrate(points[: sweep.own], registered.state)
         match = registered.match if registered.rival is None else spread(registered.match, registered.rival)
         tracked = Tracked(
             scan=replace(scan, T_odom_base=None)
@@ -191,10 +191,10 @@ class Odometry:
         A wheel motion that no vehicle can make is rejected in any case. The scan does not count where most of the
         last ones were lost or contradicted.
         """
-        prediction = self.predictor.predict(scan, sparse.middle_s)
+        prediction = self.predictor.predict(scan, sparse)
         if prediction.jump_m == 0.0 or not len(self.map.surfaces):
             return prediction
-        free = self.predictor.predict(scan, sparse.middle_s, by_wheels=False)
+        free = self.predictor.predict(scan, sparse, by_wheels=False)
         is_wrong = lie.apart(prediction.T_odom_last, prediction.T_odom_lidar)[0] > free.farthest_m
         points = sparse.from_middle(free.scan_motion)
         if not is_wrong and len(points) and not self.predictor.doubts_scans:
@@ -288,7 +288,7 @@ class Odometry:
             self.map.extend(points, self.predictor.T_odom_lidar, is_standing=registered.is_standing)
 
     def _calibrate(self, points: Points, state: State) -> None:
-        """Add the scan to the elevation calibration; rebuild the map where the offset changes."""
+        """Add the points of the scan's own lidar to the elevation calibration; rebuild the map if it changes."""
         if state is State.LOST:
             self.elevation.reset()
         if state is State.LOST or not self.predictor.scan_motion.twist.any():  # the first scan cannot be deskewed

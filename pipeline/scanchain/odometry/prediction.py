@@ -19,7 +19,7 @@ from scanchain.odometry.gyro import Gyro
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import ErrorStatistics, MotionFilter
 from scanchain.odometry.wheels import Wheels
-from scanchain.preprocess import ScanMotion
+from scanchain.preprocess import ScanMotion, Sweep
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps are too close
@@ -192,12 +192,9 @@ class Predictor:
         self.lost_s = 0.0
         self.scans, self.doubtful = 0, 0.0  # the latter: share of lost or contradicted scans, 1 after a jump
 
-    def predict(self, scan: Scan, middle_s: float, *, by_wheels: bool = True) -> Prediction:
-        """The predicted pose of a scan that follows the last one corrected.
-
-        middle_s : seconds from its stamp to its middle, for which the pose is
-        """
-        times, turning = self.intervals, self.gyro.predict(scan, middle_s)
+    def predict(self, scan: Scan, sweep: Sweep, *, by_wheels: bool = True) -> Prediction:
+        """The predicted pose, at its middle, of a scan that follows the last one corrected."""
+        times, turning = self.intervals, self.gyro.predict(scan, sweep)
         interval_s = times.to(scan)
         wheel = self.wheels.motion(scan) if by_wheels and times.last_scan is not None else None
         source, is_guess, jump_m = Source.CONSTANT_VELOCITY if wheel is None else Source.WHEELS, False, 0.0

@@ -85,7 +85,7 @@ class Opened:
             known += f"; lidar at {at} m of {log.mounting.base_name}{turned and f', turned by {turned}'}"
             known += " at the first scan, moving on it" if is_moving else ""
         paths = ", ".join(map(str, log.paths))
-        return f"{paths} {log.topic} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
+        return f"{paths} {log.topics} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
 
 
 def opened(job: Job, progress: Progress) -> Opened:

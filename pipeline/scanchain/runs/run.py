@@ -108,7 +108,7 @@ class _Run:
         if self.checkpoints.absent:
             announce(self.checkpoints.absent)
         count = counted(log.scan_count, "scan")
-        self.progress.say(f"{log.topic}: {log.dimension}D, {count}; {self.source.configuration}")
+        self.progress.say(f"{log.topics}: {log.dimension}D, {count}; {self.source.configuration}")
         for gap in log.gaps:
             announce(f"warning: {gap}")
         if left is not None:

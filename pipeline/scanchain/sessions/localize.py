@@ -145,7 +145,7 @@ def localize(
             f"{log.name}: has {log.dimension}D scans, the map {prior.name} is {prior.dimension}D; give a map of "
             "the same kind"
         )
-    progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
+    progress.say(f"{log.topics}: {counted(log.scan_count, 'scan')}; map {prior.name}")
     with directory:
         directory.begin(source.configuration, config)
         compile_ahead([f"{log.dimension}d", "rest"], progress.compiling)
@@ -365,7 +365,7 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, sensor_notes: tuple[
     names = ", ".join(session.name for session in prior.sessions)
     paths, scans = ", ".join(map(str, log.paths)), counted(m.scans, "scan")
     return text_of(m.judged, [
-        ("log", f"{paths} {log.topic}: {scans} over {m.path_m:.1f} m"),
+        ("log", f"{paths} {log.topics}: {scans} over {m.path_m:.1f} m"),
         ("map", f"{prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}"),
         *lines_of(m),
         *(("segment", part.text) for part in m.parts),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanchain.checks import LONGEST_SWEEP_S
 from scanchain.config import LogConfig
-from scanchain.data import RawPoints
+from scanchain.data import OtherPoints, RawPoints
 from scanchain.errors import counted
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.logs.index import Decoded
@@ -122,6 +122,7 @@ class Returns(NamedTuple):
     times_s : (N,) float32 seconds after ``stamp_ns``, or (0,); inferred from the message alone
     dropped : number of invalid returns; why : reason if no return is valid
     stated : times as in the message
+    others : sweeps of other lidars, in the frame of the first publisher of the topic
     """
 
     stamp_ns: int
@@ -131,6 +132,13 @@ class Returns(NamedTuple):
     why: str
     frame: str = ""
     stated: Field | Beams | None = None
+    others: tuple[OtherPoints, ...] = ()
+
+    @property
+    def middle_ns(self) -> int:
+        """Time in the middle of the points."""
+        ends_s = (float(self.times_s.min()), float(self.times_s.max())) if len(self.times_s) else (0.0, 0.0)
+        return self.stamp_ns + round(0.5e9 * sum(ends_s))
 
     @property
     def end_ns(self) -> int:
@@ -205,8 +213,8 @@ class PointTimes:
             self.assumed = f"{_NO}: field {name} ({kind}) is constant ({first:.10g}); {_AT_ONCE}"
         return field
 
-    def checked(self, messages: Iterable[Decoded], topic: str) -> Iterator[Decoded]:
-        """Messages in their order, the scans of the topic with checked times."""
+    def checked(self, messages: Iterable[Decoded], topic: str, *, most_ns: float = inf) -> Iterator[Decoded]:
+        """Messages in their order, the scans of the topic with checked times, held back by ``most_ns`` at most."""
         waiting, before, ahead = deque[Decoded](), deque[Returns](maxlen=_BEFORE), deque[Returns]()
         for message in chain(messages, [None]):
             if message is not None:
@@ -214,7 +222,11 @@ class PointTimes:
                 if isinstance(message.value, Returns) and message.channel.topic == topic:
                     ahead.append(message.value)
             while waiting and (
-                message is None or len(ahead) > _AFTER or not ahead or waiting[0].value is not ahead[0]
+                message is None
+                or len(ahead) > _AFTER
+                or not ahead
+                or waiting[0].value is not ahead[0]
+                or message.log_time_ns - waiting[0].log_time_ns > most_ns
             ):
                 first = waiting.popleft()
                 if ahead and first.value is ahead[0]:
