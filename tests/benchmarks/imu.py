@@ -79,8 +79,8 @@ def main() -> None:
         made_of = {"sensor": sensor, "seconds": options.seconds, "pace": options.pace, "seed": seed, "imu": imu}
         path = made.log(world, folder=options.cache, **made_of)
         truth = scanchain.read_tum(path.with_suffix(".tum"))
-        ours = driven(scanchain.open_log(path), truth)
         without = driven(scanchain.open_log(path, imu_topic="none"), truth)
+        ours = driven(scanchain.open_log(path), truth)
         pairs = zip(ours[:3], without[:3], strict=True)
         cells = [f"{value:.4f}" for pair in pairs for value in pair]
         ratio = f"{ours.scan_ms / without.scan_ms:.2f}"

@@ -49,6 +49,6 @@ def test_a_clock_that_jumps_back_removes_the_samples_before(stream):
 
 def test_memory_holds_the_latest_samples_only():
     stream = SampleStream()
-    for stamp_ns in range(1000):
+    for stamp_ns in range(5000):
         stream.add(Turn(stamp_ns, 0.0))
-    assert stream.at(0).stamp_ns > 0 and len(stream.between(0, 1000)) == 512
+    assert stream.at(0).stamp_ns > 0 and len(stream.between(0, 5000)) == 4096

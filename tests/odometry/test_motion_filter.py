@@ -69,3 +69,16 @@ def test_a_turn_carries_what_is_wrong_with_the_pose_along():
     found.begin(lie.pose_2d(2.0, 0.0, 0.0))
     found.pose_covariance = np.diag([0.0, 0.0, 0.01])
     assert found.predicted(np.zeros(3))[0][1, 1] == pytest.approx(4.0 * 0.01, rel=1e-3)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_measured_rotation_replaces_that_of_the_motion_and_leaves_its_translation_as_it_was(d):
+    k = 3 if d == 2 else 6
+    found = MotionFilter(0.25 * np.eye(k))
+    found.correct(0.2 * np.ones(k), 1e4 * np.eye(k), 1e-4 * np.eye(k))
+    before, covariance = lie.log(found.motion)[:d], found.motion_covariance[:d, :d].copy()
+    rotation = np.array([0.1, -0.2, 0.3])[-(k - d) :]
+    found.turn(rotation)
+    np.testing.assert_allclose(lie.log(found.motion), [*before, *rotation], atol=1e-12)
+    np.testing.assert_array_equal(found.motion_covariance[:d, :d], covariance)
+    assert not found.motion_covariance[d:].any() and not found.covariance[:, d:].any()

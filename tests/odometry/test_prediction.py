@@ -9,6 +9,7 @@ from scanchain import lie
 from scanchain.data import Scan, State
 from scanchain.odometry.odometry import first_match
 from scanchain.odometry.prediction import Predictor, Source
+from scanchain.preprocess import sweep_of
 from tests.support.drives import NO_WHEELS
 from tests.support.scenes import configured
 
@@ -30,7 +31,7 @@ def predicted(dimension, position, times_s, wheels=None, lost=()):
         T_odom_base = None if wheels is None else at(wheels(time_s), dimension)
         scan = Scan.of(np.empty((0, dimension)), time_s, index=index, T_odom_base=T_odom_base)
         scan = replace(scan, log_time_ns=scan.stamp_ns)
-        prediction = predictor.predict(scan)
+        prediction = predictor.predict(scan, sweep_of(scan, config.preprocess))
         if index + 1 < len(times_s):
             match = first_match(at(position(time_s), dimension), np.zeros((1000, dimension)), config.matching)
             predictor.correct(scan, prediction, match, State.LOST if index in lost else State.OK)
@@ -129,7 +130,8 @@ def test_wheels_predict_the_motion_that_they_measure_and_a_jump_of_theirs_is_tol
     assert found.source is Source.WHEELS and found.prior.is_measured
     assert found.T_odom_lidar[0, -1] == pytest.approx(4.0 + off_m, abs=1e-6)
     assert found.jump_m == pytest.approx(jump_m, abs=1e-3)
-    again = predictor.predict(Scan.of(np.empty((0, dimension)), 2.0, index=20), by_wheels=False)
+    scan = Scan.of(np.empty((0, dimension)), 2.0, index=20)
+    again = predictor.predict(scan, sweep_of(scan, configured(dimension).preprocess), by_wheels=False)
     assert again.source is Source.CONSTANT_VELOCITY and not again.prior.is_measured
 
 

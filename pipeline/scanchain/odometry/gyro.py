@@ -122,7 +122,8 @@ class Gyro:
             self._compare(self.motions[-1], motion)
         self.motions.append(motion)
         self.count += 1
-        if self.count >= self.next_fit:
+        ours = sum(error for error, _ in self.errors)
+        if self.count >= self.next_fit and not ours < len(self.errors) * _SIGMA_RAD**2:
             self.next_fit = _FITS * self.count
             self._fit()
 
@@ -280,7 +281,7 @@ def _defect(knots_s: Vector, rates: Matrix) -> str:
     """Why rates (M, 3) between the first and the last knot do not give the rotation; empty if they do."""
     if float(np.diff(knots_s).max()) > _BRIDGED_S:
         return f"no sample for more than {_BRIDGED_S:g} s"
-    if len(rates) >= _REPEATED and not np.ptp(rates, axis=0).any():
+    if len(rates) >= _REPEATED and rates.any() and not np.ptp(rates, axis=0).any():
         return "rates that do not change"
     largest = np.abs(rates).max(initial=0.0)
     if largest > _LEAST_CLIPPED_RAD_S and np.count_nonzero(np.abs(rates) == largest) >= _REPEATED:

@@ -1,0 +1,103 @@
+"""The IMU of a log: which topic it is, how it is turned on the lidar, and the samples that come with a scan."""
+
+import numpy as np
+import pytest
+
+import scanchain
+from scanchain import lie
+from scanchain.errors import InputError
+from scanchain.logs.info import describe
+from scanchain.logs.writer import LogWriter, pack_imu
+from scanchain.settings import load_settings
+from scanchain.simulation.imu import IMUS
+from tests.support import made
+
+STAMPS_NS = np.arange(0, 1_000_000_000, 10_000_000)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return made.log("turns", sensor="vlp-16", seconds=3.0, imu="mems")
+
+
+def with_more(log, folder, topics, **fields):
+    """Log files: the given one, and one with further IMUs."""
+    path = folder / "more.mcap"
+    begin_ns = scanchain.open_log(log).expected_stamps("/points")[0]
+    with LogWriter(path) as writer:
+        for topic in topics:
+            for stamp_ns in begin_ns + STAMPS_NS:
+                data = pack_imu(int(stamp_ns), fields.get("frame", "imu_link"), np.zeros(3), np.zeros(3))
+                writer.append(topic, "sensor_msgs/msg/Imu", data, int(stamp_ns))
+    return [log, path]
+
+
+def test_the_only_imu_is_found_with_its_rotation_on_the_lidar(log):
+    opened = scanchain.open_log(log)
+    assert opened.imu.topic == "/imu/data"
+    expected = lie.inverse(opened.mounting.T_base_lidar) @ IMUS["mems"].T_base_imu
+    np.testing.assert_allclose(opened.imu.R_lidar_imu, expected[:3, :3], atol=1e-9)
+
+
+def test_scans_have_all_samples_in_order_each_once_to_their_end(log):
+    scans = list(scanchain.open_log(log))
+    stamps_ns = np.concatenate([each.inertial.stamps_ns for each in scans])
+    assert (np.diff(stamps_ns) == 5_000_000).all()
+    for scan in scans[:-1]:
+        end_ns = scan.stamp_ns + round(1e9 * float(scan.times_s.max()))
+        assert end_ns <= scan.inertial.stamps_ns[-1] < end_ns + 5_000_000
+        assert scan.inertial.rates.shape == scan.inertial.accelerations.shape == (len(scan.inertial.stamps_ns), 3)
+    assert np.linalg.norm(scans[0].inertial.accelerations, axis=1).mean() == pytest.approx(9.81, abs=0.1)
+
+
+def test_none_leaves_it_unused_and_a_topic_that_is_none_is_refused(log):
+    assert scanchain.open_log(log, imu_topic="none").imu is None
+    assert all(scan.inertial is None for scan in scanchain.open_log(log, imu_topic="none"))
+    with pytest.raises(
+        InputError, match=r"log.imu_topic /odom is not a topic of sensor_msgs/Imu; these are: /imu/data"
+    ):
+        scanchain.open_log(log, imu_topic="/odom")
+
+
+def test_of_several_none_is_used_until_one_is_chosen(log, tmp_path):
+    logs = with_more(log, tmp_path, ["/camera/imu"])
+    opened = scanchain.open_log(logs)
+    assert opened.imu is None
+    assert "several IMUs (/camera/imu, /imu/data), none is used; choose with --log.imu_topic" in opened.notes
+    assert scanchain.open_log(logs, imu_topic="/camera/imu").imu.topic == "/camera/imu"
+
+
+def test_without_a_transform_its_rotation_is_unknown_and_in_the_lidars_own_frame_none_is_needed(log, tmp_path):
+    elsewhere = with_more(log, tmp_path, ["/a"], frame="unknown")
+    assert scanchain.open_log(elsewhere, imu_topic="/a").imu.R_lidar_imu is None
+    (tmp_path / "own").mkdir()
+    own = with_more(log, tmp_path / "own", ["/a"], frame="lidar")
+    np.testing.assert_array_equal(scanchain.open_log(own, imu_topic="/a").imu.R_lidar_imu, np.eye(3))
+
+
+def test_that_of_a_planar_lidar_upside_down_is_as_seen_from_above():
+    planar = made.log("office", seconds=3.0, imu="mems")
+    usual, mirrored = (
+        next(iter(scanchain.open_log(planar, upside_down=each))).inertial.R_lidar_imu for each in (False, True)
+    )
+    np.testing.assert_allclose(mirrored, np.diag([1.0, -1.0, -1.0]) @ usual)
+
+
+def test_a_sample_that_is_not_finite_is_left_out_and_counted(log, tmp_path):
+    path = tmp_path / "bad.mcap"
+    begin_ns = int(scanchain.open_log(log).expected_stamps("/points")[0])
+    with LogWriter(path) as writer:
+        for k, stamp_ns in enumerate((begin_ns + STAMPS_NS).tolist()):
+            rates = np.full(3, np.nan if k == 5 else 0.0)
+            data = pack_imu(stamp_ns, "imu_link", rates, np.zeros(3))
+            writer.append("/b", "sensor_msgs/msg/Imu", data, stamp_ns)
+    opened = scanchain.open_log([log, path], imu_topic="/b")
+    list(opened)
+    assert any("1 malformed message of /b left out" in line for line in opened.damage)
+
+
+def test_info_says_what_it_is_used_for(log):
+    said = describe([log], load_settings(3).config.log)["sensors"]
+    assert [each.use for each in said if each.sensor == "IMU"] == [
+        "its gyro predicts rotations where it does so better than the scans"
+    ]
