@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # "as" says that the name is public here
     from scanchain.api import optimize as optimize
     from scanchain.api import run as run
     from scanchain.config import Config as Config
+    from scanchain.data import Inertial as Inertial
     from scanchain.data import Match as Match
     from scanchain.data import Scan as Scan
     from scanchain.data import State as State
@@ -51,7 +52,7 @@ if TYPE_CHECKING:  # "as" says that the name is public here
 _MODULES = {
     "api": "changes cloud compare downsample judge localize merge optimize run",
     "config": "Config",
-    "data": "Match Scan State Step Trajectory",
+    "data": "Inertial Match Scan State Step Trajectory",
     "errors": "InputError ScanchainError",
     "evaluation.metrics": "evaluate",
     "graph.g2o": "read_g2o write_g2o",

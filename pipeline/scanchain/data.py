@@ -150,6 +150,8 @@ class Scan:
         _set(self, "times_s", checks.point_times(self.times_s, "times_s", len(points)))
         if self.origin is not None:
             _set(self, "origin", checks.matrices(self.origin, "origin", (d,)))
+        if self.inertial is not None:
+            _set(self, "inertial", checks.inertial(self.inertial, "inertial"))
         if self.T_odom_base is not None:
             _set(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
 

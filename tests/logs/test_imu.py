@@ -96,6 +96,23 @@ def test_a_sample_that_is_not_finite_is_left_out_and_counted(log, tmp_path):
     assert any("1 malformed message of /b left out" in line for line in opened.damage)
 
 
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"stamps_ns": np.array([2, 1])}, "inertial.stamps_ns do not ascend"),
+        ({"stamps_ns": np.array([0.1, 0.2])}, "inertial.stamps_ns holds float64"),
+        ({"rates": np.zeros((3, 3))}, r"inertial.rates .* \(2, 3\)"),
+        ({"accelerations": np.full((2, 3), np.nan)}, "inertial.accelerations holds NaN"),
+        ({"R_lidar_imu": 2.0 * np.eye(3)}, "inertial.R_lidar_imu is not a rotation"),
+    ],
+)
+def test_samples_given_in_python_are_checked(changed, words):
+    sound = scanchain.Inertial(np.array([1, 2]), np.zeros((2, 3)), np.zeros((2, 3)), np.eye(3))
+    assert scanchain.Scan.of(np.ones((5, 3)), 1.0, inertial=sound).inertial.rates.shape == (2, 3)
+    with pytest.raises(InputError, match=words):
+        scanchain.Scan.of(np.ones((5, 3)), 1.0, inertial=sound._replace(**changed))
+
+
 def test_info_says_what_it_is_used_for(log):
     said = describe([log], load_settings(3).config.log)["sensors"]
     assert [each.use for each in said if each.sensor == "IMU"] == [

@@ -1,5 +1,7 @@
 """The gyro: rotations along its samples, what is wrong with them is found out, and it is used where it helps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -150,6 +152,17 @@ def test_a_rotation_by_scans_that_is_far_off_does_not_move_the_bias():
     gyro.correct(lie.exp(np.r_[np.zeros(3), gyro.rotation + np.array([0.0, 0.0, 0.1])]))
     assert gyro.errors[-1][0] > 0.005
     assert np.array_equal(before, gyro.model.bias)
+
+
+def test_after_a_jump_of_the_clock_it_goes_on_with_new_samples():
+    gyro = Gyro(3)
+    drive(gyro)
+    stamps_ns = np.arange(10**9, 10**9 + 10**8, 5_000_000)
+    inertial = Inertial(stamps_ns, np.zeros((20, 3)), np.zeros((20, 3)), ALIGNED)
+    scan = Scan.of(np.ones((2, 3)), 1.0, np.array([0.0, SCAN_S]), index=80, inertial=inertial)
+    gyro.add(replace(scan, clock_jump_s=-1e9))
+    assert [len(times_s) for times_s, _ in gyro.blocks] == [20]
+    assert gyro.predict(scan, sweep_of(scan, PreprocessConfig())) is None
 
 
 def test_while_it_predicts_worse_than_the_last_motion_it_is_not_used():

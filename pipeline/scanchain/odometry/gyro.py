@@ -1,4 +1,4 @@
-"""The gyro of an IMU: rotations between and during scans, calibrated on those by the scans and tested on them."""
+"""The gyro of an IMU: rotations between and during scans, calibrated and tested against scan matching."""
 
 from __future__ import annotations
 
@@ -89,7 +89,11 @@ class Gyro:
         return _SIGMA_RAD + _SIGMA * float(np.linalg.norm(self.rotation))
 
     def add(self, scan: Scan) -> None:
-        """Add the samples that came with a scan."""
+        """Add the samples that came with a scan; those of another clock go."""
+        if scan.clock_jump_s:
+            self.blocks.clear()
+            self.motions.clear()
+            self.last_s = math.nan
         if (found := scan.inertial) is None or not len(found.stamps_ns):
             return
         self.origin_ns = self.origin_ns or int(found.stamps_ns[0])
