@@ -190,6 +190,7 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
     """Motion prediction, search width after a failed match, and spacing of keyframes.
 
     prior : motion prediction: by wheel odometry, at constant velocity, or by the wheels where the log has them
+    imu : whether the gyro of an IMU is used, where it predicts rotations better than the scans do
     wheel_sigma_m : largest standard deviation of a translation predicted by the wheels; the usual one is
         estimated while running
     wheel_sigma_rad : the same for a rotation
@@ -206,6 +207,7 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
     """
 
     prior: Literal["auto", "wheel", "constant-velocity"] = "auto"
+    imu: bool = True
     wheel_sigma_m: Positive = 0.05
     wheel_sigma_rad: Positive = 0.05
     velocity_sigma_m: Positive = 0.5

@@ -305,6 +305,17 @@ def test_every_run_of_a_method_is_judged_by_its_own_poses_and_compared_with_the_
 
 
 @pytest.mark.usefixtures("in_process")
+def test_the_gyro_is_used_by_the_methods_that_name_the_imu_and_is_a_row_where_the_log_has_one(tmp_path):
+    assert "plicp+imu" in default_names(3, has_imu=True) and "plicp+imu" not in default_names(3)
+    log = made.log("turns", sensor="vlp-16", seconds=4.0, imu="mems")
+    table = run(log, tmp_path, "plicp", "plicp+imu")
+    without, with_imu = table.rows
+    assert with_imu.figures["ate_m"] < 0.8 * without.figures["ate_m"]
+    steps = pq.read_table(tmp_path / "out" / "per_scan.parquet").to_pandas()
+    assert len(steps) == 80
+
+
+@pytest.mark.usefixtures("in_process")
 def test_methods_for_clouds_follow_planar_scans_in_the_plane(office, tmp_path):
     names = [name for name in default_names(2) if name not in OURS]
     table = run(office, tmp_path, *names, overrides=(Override("log.end_s", "3.0", ""),))
@@ -354,7 +365,7 @@ def test_a_table_of_settings_sets_a_method_or_makes_a_variant_of_it_and_can_be_g
     ("names", "dimension", "settings", "words"),
     [
         (["gicp"], 3, "", r"no method 'gicp'; choose among open3d-gicp, small-gicp, small-vgicp, or"),
-        (["plicp", "icp"], 3, "", r"no method 'icp'; choose among plicp, plicp\+loops, open3d-gicp"),
+        (["plicp", "icp"], 3, "", r"no method 'icp'; choose among plicp, plicp\+loops, plicp\+imu, open3d-gicp"),
         (["genz-icp"], 2, "", "made for 3D"),
         (["plicp", "open3d-p2l"], 2, "", "open3d-p2l is made for 3D"),
         (["open3d", "open3d-p2p"], 3, "", "names one twice"),

@@ -78,7 +78,7 @@ def compare(
     log = open_log(logs, load_settings(overrides=of_log).config.log)
     choose_point_times(log)
     settings = load_settings(log.dimension, overrides=of_log)
-    names = methods or default_names(log.dimension)
+    names = methods or default_names(log.dimension, has_imu=log.imu is not None)
     chosen = resolve(names, log.dimension, file=config_file, overrides=overrides, matcher=matcher)
     with directory:
         directory.begin(", ".join(method.name for method in chosen))

@@ -18,10 +18,10 @@ from scanchain.registration import create_matcher
 from scanchain.settings import Override, leaves, load_settings, read_toml
 
 _ANY = "matcher"  # ours with the matcher that the settings name
-OURS = (*MATCHERS, *(f"{name}+loops" for name in MATCHERS), _ANY, f"{_ANY}+loops")
+OURS = tuple(f"{name}{with_}" for name in (*MATCHERS, _ANY) for with_ in ("", "+loops", "+imu"))
 _ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti")
 _BASE = "method"  # the key of a table that names the method it is a variant of
-_KINDS = ("matching.matcher", "loops.enabled")  # keys that distinguish our methods
+_KINDS = ("matching.matcher", "loops.enabled", "odometry.imu")  # keys that distinguish our methods
 _SECTIONS = Config.__struct_fields__
 _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configuration that no single method has
 
@@ -44,11 +44,12 @@ class Method(Struct, frozen=True):
         return self.base in OURS
 
 
-def default_names(dimension: int) -> tuple[str, ...]:
-    """Methods that apply to logs of this dimension."""
+def default_names(dimension: int, *, has_imu: bool = False) -> tuple[str, ...]:
+    """Methods that apply to logs of this dimension, with or without an IMU."""
     others = [name for name in BASELINES if name not in _ON_REQUEST]
     planar = [name for name in others if BASELINES[name].planar is not None]
-    return (*MATCHERS, "plicp+loops", *(others if dimension == 3 else planar))
+    with_imu = ("plicp+imu",) if has_imu else ()
+    return (*MATCHERS, "plicp+loops", *with_imu, *(others if dimension == 3 else planar))
 
 
 def resolve(
@@ -87,7 +88,7 @@ def resolve(
     for override in overrides:
         if override.key in _KINDS:
             raise InputError(
-                f"{override.flag} distinguishes plicp, svd and +loops; choose by --methods or --matcher"
+                f"{override.flag} distinguishes plicp, svd, +loops and +imu; choose by --methods or --matcher"
             )
     ours = (shared_settings(file), overrides)
     return tuple(_method(name, tables.get(name, {}), dimension, f"{file}: [{name}]", *ours) for name in names)
@@ -149,9 +150,9 @@ def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int
 def _our_settings(
     base: str, own: Sequence[Override], dimension: int, shared: Sequence[Override], overrides: Sequence[Override]
 ) -> dict[str, Any]:
-    """The configuration of one of ours; no wheels unless requested, since nobody else has them."""
+    """The configuration of one of ours; no wheels and IMU unless requested, since nobody else has them."""
     wheels = Override("odometry.prior", "constant-velocity", "scanchain compare")
-    kind = {"loops.enabled": str("+" in base).lower()}
+    kind = {"loops.enabled": str("+loops" in base).lower(), "odometry.imu": str("+imu" in base).lower()}
     if base.partition("+")[0] != _ANY:
         kind["matching.matcher"] = base.partition("+")[0]
     for each in own:

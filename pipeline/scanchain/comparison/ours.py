@@ -56,5 +56,5 @@ def _description(config: Config) -> str:
     size_m = np.format_float_positional(config.local_map.voxel_size_m, trim="-")
     return (
         f"ours, {config.matching.matcher}{steps}, scan to map, voxels of {size_m} m, "
-        f"one thread, {wheels}, {deskewing}"
+        f"one thread, {wheels}, {'with' if config.odometry.imu else 'no'} IMU, {deskewing}"
     )

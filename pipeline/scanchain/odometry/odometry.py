@@ -138,7 +138,8 @@ class Odometry:
     def _tracked(self, scan: Scan | Prepared) -> Tracked:
         prepared = scan if isinstance(scan, Prepared) else prepare(scan, self.resolution)
         scan, self.resolution = prepared.scan, prepared.after
-        self.predictor.gyro.add(scan)
+        if self.config.odometry.imu:
+            self.predictor.gyro.add(scan)
         self.scans += 1
         sample = scan.points[:: len(scan.points) // _SAMPLE + 1].tobytes()
         if self.last is not None and sample == self.last_sample and len(scan.points) >= _FEWEST_COPIED:
