@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from scanchain.config_keys import LARGEST
-from scanchain.data import Inertial
 from scanchain.errors import InputError, one_line, shown
 from scanchain.kernels.geometry import largest_magnitude, rigidity_error
 from scanchain.kernels.voxels import REACH
@@ -233,23 +232,6 @@ def indices(value: object, name: str) -> NDArray[np.int64]:
     """Pairs (E, 2) of whole numbers."""
     pairs, wanted = _array(value, name, "(E, 2) indices of poses"), "(E, 2) whole numbers: indices of poses"
     return whole_numbers(_shaped(pairs, name, (None, 2), wanted), name, "(E, 2) indices of poses")
-
-
-def inertial(value: Inertial, name: str) -> Inertial:
-    """Samples of an IMU with ascending stamps; the rotation to the lidar may be missing."""
-    instance(value, Inertial, name, "Inertial(stamps_ns, rates, accelerations, R_lidar_imu)")
-    stamps_ns = whole_numbers(value.stamps_ns, f"{name}.stamps_ns", "nanoseconds")
-    if not (np.diff(stamps_ns) > 0).all():
-        raise InputError(f"{name}.stamps_ns do not ascend")
-    wanted, R = (len(stamps_ns), 3), value.R_lidar_imu
-    rates, accelerations = (
-        matrices(each, f"{name}.{of}", wanted)
-        for each, of in ((value.rates, "rates"), (value.accelerations, "accelerations"))
-    )
-    R = None if R is None else matrices(R, f"{name}.R_lidar_imu", (3, 3))
-    if R is not None and not np.abs(R @ R.T - np.eye(3)).max() <= RIGID:
-        raise InputError(f"{name}.R_lidar_imu is not a rotation; wanted RᵀR = I")
-    return Inertial(stamps_ns, rates, accelerations, R)
 
 
 def instance(value: object, kind: type, name: str, remedy: str) -> None:

@@ -101,6 +101,23 @@ class Inertial(NamedTuple):
     accelerations: Matrix
     R_lidar_imu: Matrix | None = None
 
+    def checked(self) -> Inertial:
+        """The same, converted if nothing is lost. Raises InputError for any other shape, dtype or value."""
+        from scanchain import checks
+
+        stamps_ns = checks.whole_numbers(self.stamps_ns, "inertial.stamps_ns", "nanoseconds")
+        if not (np.diff(stamps_ns) > 0).all():
+            raise InputError("inertial.stamps_ns do not ascend")
+        rates, accelerations = (
+            checks.matrices(getattr(self, name), f"inertial.{name}", (len(stamps_ns), 3))
+            for name in ("rates", "accelerations")
+        )
+        R = self.R_lidar_imu
+        R = None if R is None else checks.matrices(R, "inertial.R_lidar_imu", (3, 3))
+        if R is not None and not np.abs(R @ R.T - np.eye(3)).max() <= checks.RIGID:
+            raise InputError("inertial.R_lidar_imu is not a rotation; wanted RᵀR = I")
+        return Inertial(stamps_ns, rates, accelerations, R)
+
 
 @dataclass(frozen=True, slots=True)
 class Scan:
@@ -151,7 +168,9 @@ class Scan:
         if self.origin is not None:
             _set(self, "origin", checks.matrices(self.origin, "origin", (d,)))
         if self.inertial is not None:
-            _set(self, "inertial", checks.inertial(self.inertial, "inertial"))
+            wanted = "Inertial(stamps_ns, rates, accelerations, R_lidar_imu)"
+            checks.instance(self.inertial, Inertial, "inertial", wanted)
+            _set(self, "inertial", self.inertial.checked())
         if self.T_odom_base is not None:
             _set(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
 

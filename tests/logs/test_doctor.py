@@ -260,7 +260,7 @@ def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_
     assert "wheels    /odom" in text and "/odom:" not in text
     assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off", *flags]) == 0
     text = capfd.readouterr().out
-    assert "note           IMU /imu/data: not used\n" in text and "note           GNSS /fix: not used\n" in text
+    assert "1 malformed message of /imu/data left out" in text and "note           GNSS /fix: not used\n" in text
     assert "/ground_truth: evaluates" not in text
     other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
     saved(tmp_path, [*said, *other], rename=lambda kind: names.get(kind, kind))
