@@ -73,7 +73,7 @@ class Gyro:
         self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared: of the gyro, of equal motion
         self.count, self.compared, self.next_fit = 0, 0, float(_FIRST_FIT)
         self.scans, self.used = 0, 0
-        self.sums = np.zeros(2)  # of all errors
+        self.sums = np.zeros(2)  # of all errors of this model
         self.bias_variance = _BIAS_RAD_S**2
         self.unusable: Counter[str] = Counter()  # scans by defect
 
@@ -145,7 +145,7 @@ class Gyro:
         """Defects of the IMU, a line each."""
         lines = [*self.model.faults] if self.model else []
         lines += [f"{defect} at {counted(count, 'scan')}" for defect, count in self.unusable.items()]
-        if self.compared and not self.used:
+        if self.motions and not self.used:
             lines.append("it is not used, since it predicts no rotation better than the scans do")
         return tuple(f"IMU: {line}" for line in lines)
 
@@ -228,7 +228,7 @@ class Gyro:
             return
         if not self.is_used:
             self.errors.clear()
-            self.bias_variance = _BIAS_RAD_S**2
+            self.compared, self.sums, self.bias_variance = 0, np.zeros(2), _BIAS_RAD_S**2
         self.model = best
 
     def _delay(self, rotations: Matrix, measured: Callable[[Vector], tuple[Matrix, Mask]]) -> float:
