@@ -306,6 +306,8 @@ def test_every_run_of_a_method_is_judged_by_its_own_poses_and_compared_with_the_
 
 @pytest.mark.usefixtures("in_process")
 def test_the_gyro_is_used_by_the_methods_that_name_the_imu_and_is_a_row_where_the_log_has_one(tmp_path):
+    [own] = resolve(["SvdMatcher+imu"], 3, file=None, matcher="scanchain.registration.svd_icp:SvdMatcher")
+    assert own.settings["odometry"]["imu"] and not own.settings["loops"]["enabled"]
     assert "plicp+imu" in default_names(3, has_imu=True) and "plicp+imu" not in default_names(3)
     log = made.log("turns", sensor="vlp-16", seconds=4.0, imu="mems")
     table = run(log, tmp_path, "plicp", "plicp+imu")

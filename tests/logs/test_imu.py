@@ -11,6 +11,7 @@ from scanchain.logs.writer import LogWriter, pack_imu
 from scanchain.settings import load_settings
 from scanchain.simulation.imu import IMUS
 from tests.support import made
+from tests.support.several_lidars import looped
 
 STAMPS_NS = np.arange(0, 1_000_000_000, 10_000_000)
 
@@ -48,6 +49,15 @@ def test_scans_have_all_samples_in_order_each_once_to_their_end(log):
         assert end_ns <= scan.inertial.stamps_ns[-1] < end_ns + 5_000_000
         assert scan.inertial.rates.shape == scan.inertial.accelerations.shape == (len(scan.inertial.stamps_ns), 3)
     assert np.linalg.norm(scans[0].inertial.accelerations, axis=1).mean() == pytest.approx(9.81, abs=0.1)
+
+
+def test_after_a_jump_of_the_clock_scans_have_samples_again(log, tmp_path):
+    path = looped(log, tmp_path / "looped.mcap", laps=2)
+    scans = list(scanchain.open_log(path))
+    assert len(scans) == 60
+    jumped = next(k for k, scan in enumerate(scans) if scan.clock_jump_s)
+    assert all(scan.inertial is not None for scan in scans[jumped + 1 :])
+    assert scans[jumped].stamp_ns < scans[jumped - 1].stamp_ns
 
 
 def test_none_leaves_it_unused_and_a_topic_that_is_none_is_refused(log):

@@ -30,10 +30,9 @@ from tests.support.naive_logs import (
     write,
 )
 from tests.support.scenes import shared_data
-from tests.support.several_lidars import on_own_topics, turned, two_lasers
+from tests.support.several_lidars import LEFT, RIGHT, on_own_topics, turned, two_lasers
 
 STEP_NS = SECOND // 10
-LEFT, RIGHT = ("base_link", "left", 0.3, 0.1, 0.5, 0.0), ("base_link", "right", -0.2, -0.1, -2.0, 0.0)
 BOTH = ("/left", "/right")
 BEAM_S = 0.003  # of 31 beams
 

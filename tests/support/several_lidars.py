@@ -8,6 +8,9 @@ from scanchain.logs.topics import topics_of
 from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_transforms, place
 from tests.support.naive_logs import SECOND
 
+# frames and places of two lasers: x, y, yaw, roll
+LEFT, RIGHT = ("base_link", "left", 0.3, 0.1, 0.5, 0.0), ("base_link", "right", -0.2, -0.1, -2.0, 0.0)
+
 
 def two_lasers(source, path, *, width_deg, is_flipped=False, yaws_deg=(90.0, -90.0)):
     """The scans of a laser that looks around as those of two that look aside, in turn; the second upside down."""

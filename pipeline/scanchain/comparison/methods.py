@@ -18,7 +18,8 @@ from scanchain.registration import create_matcher
 from scanchain.settings import Override, leaves, load_settings, read_toml
 
 _ANY = "matcher"  # ours with the matcher that the settings name
-OURS = tuple(f"{name}{with_}" for name in (*MATCHERS, _ANY) for with_ in ("", "+loops", "+imu"))
+_VARIANTS = ("", "+loops", "+imu")  # of ours
+OURS = tuple(f"{name}{variant}" for name in (*MATCHERS, _ANY) for variant in _VARIANTS)
 _ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti")
 _BASE = "method"  # the key of a table that names the method it is a variant of
 _KINDS = ("matching.matcher", "loops.enabled", "odometry.imu")  # keys that distinguish our methods
@@ -64,7 +65,7 @@ def resolve(
 
     file : TOML, one table a method; a table of another name is a variant of the one that its key ``method`` names
     overrides : keys of the configuration, for all of ours; sections of it in ``file`` are ``shared_settings``
-    matcher : one that is compared as well; ours with MODULE:CLASS are called CLASS and CLASS+loops
+    matcher : one that is compared as well; ours with MODULE:CLASS are called CLASS, CLASS+loops and CLASS+imu
     Raises InputError for an unknown name or key.
     """
     tables = {name: table for name, table in _tables(file).items() if name not in _SECTIONS}
@@ -72,9 +73,9 @@ def resolve(
     if matcher:
         is_class = is_class_name(matcher)
         own = matcher.rpartition(":")[2] if is_class else matcher
-        if not {own, f"{own}+loops"} & set(names):
+        if not {own + variant for variant in _VARIANTS} & set(names):
             names = [*names, own]
-        for base in (_ANY, f"{_ANY}+loops") if is_class else ():
+        for base in [_ANY + variant for variant in _VARIANTS] if is_class else []:
             name = base.replace(_ANY, own)
             if name in names:
                 tables[name] = {_BASE: base, "matching": {"matcher": matcher}} | tables.get(name, {})

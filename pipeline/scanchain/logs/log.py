@@ -38,13 +38,12 @@ from scanchain.logs.mounting import (
 from scanchain.logs.opening import index_files
 from scanchain.logs.other_lidars import OtherLidar, Together, decoder
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
-from scanchain.logs.samples import NEAREST_NS, Recorded
+from scanchain.logs.samples import HOLD_SCANS, NEAREST_NS, Recorded
 from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidars
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
-_HOLD_SCANS = 32  # largest number of scans that wait for samples after their stamp; limits memory
 
 
 def open_log(
@@ -341,7 +340,7 @@ class Log:
                 recorded.add(message)
             while waiting and (
                 message is None
-                or len(waiting) > _HOLD_SCANS
+                or len(waiting) > HOLD_SCANS
                 or message.log_time_ns - waiting[0].log_time_ns > NEAREST_NS
                 or not isinstance(first := waiting[0].value, Returns)
                 or recorded.covers(first)

@@ -21,13 +21,12 @@ from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 from scanchain.logs.messages.readers import is_scan, reader
 from scanchain.logs.mounting import place_text
 from scanchain.logs.publishers import Publishers, in_first_frame
-from scanchain.logs.samples import NEAREST_NS
+from scanchain.logs.samples import HOLD_SCANS, NEAREST_NS
 from scanchain.logs.stream import sampled_messages
 
 _SAMPLED = 16  # number of messages per block that are sampled to find frames and clock
 _TOGETHER_NS = 125_000_000  # longest time between a point and the middle of the scan it is added to
 _WAITING_NS = 2_000_000_000  # longest time between points that wait: the first lidar is missing, or a clock jumped
-_HOLD_SCANS = 32  # largest number of scans that wait for points of the others; limits memory
 _ABSENT = 2.5  # time without a lidar, in usual intervals between scans with it, above which it is missing
 
 
@@ -157,7 +156,7 @@ class Together:
                 first = waiting[0]
                 if self._is_scan(first):
                     is_late = message is None or message.log_time_ns - first.log_time_ns > NEAREST_NS
-                    if not (is_late or len(middles_ns) > _HOLD_SCANS or self._are_complete(middles_ns)):
+                    if not (is_late or len(middles_ns) > HOLD_SCANS or self._are_complete(middles_ns)):
                         break
                     middle_ns = middles_ns.popleft()
                     next_ns = middles_ns[0] if middles_ns else middle_ns

@@ -19,6 +19,7 @@ from scanchain.logs.mounting import Imu
 
 _RETAINED = 4096  # samples in memory: of 2 s and more at 2000 Hz
 NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and that a scan waits for it
+HOLD_SCANS = 32  # largest number of scans that wait for samples, or for points of other lidars; limits memory
 
 
 class Sample(Protocol):
@@ -27,12 +28,17 @@ class Sample(Protocol):
     @property
     def stamp_ns(self) -> int: ...  # noqa: D102
 
+
+class Interpolable(Sample, Protocol):
+    """Measurement that can be interpolated."""
+
     def interpolate(self, later: Self, stamp_ns: int) -> Self:
         """The sample at a stamp between this one and a later one."""
         ...
 
 
 S = TypeVar("S", bound=Sample)
+V = TypeVar("V", bound=Interpolable)
 
 
 class SampleStream(Generic[S]):
@@ -63,7 +69,7 @@ class SampleStream(Generic[S]):
         begin, end = bisect_left(self._stamps_ns, begin_ns), bisect_right(self._stamps_ns, end_ns)
         return [self._samples[stamp_ns] for stamp_ns in self._stamps_ns[begin:end]]
 
-    def at(self, stamp_ns: int) -> S | None:
+    def at(self: SampleStream[V], stamp_ns: int) -> V | None:
         """The sample at a stamp, interpolated between its neighbors or the nearest; None beyond half a second."""
         if stamp_ns in self._samples:
             return self._samples[stamp_ns]
@@ -119,6 +125,8 @@ class Recorded:
 
     def inertial(self, returns: Returns) -> Inertial | None:
         """Samples of the IMU since those of the scan before, to the first after this one; None without any."""
+        if returns.end_ns < self._given_ns - NEAREST_NS:  # the clock jumped back
+            self._given_ns = 0
         after = self.imu.between(max(self._given_ns, returns.end_ns) + 1, returns.end_ns + NEAREST_NS)[:1]
         found = self.imu.between(self._given_ns + 1, returns.end_ns) + after
         if not found:

@@ -60,8 +60,10 @@ class ElevationCalibration:
         """The sweep with the points of its own lidar raised by the offset."""
         if not self.offset_rad:
             return sweep
-        points, own = sweep.points, sweep.own
-        return replace(sweep, points=np.concatenate([raised(points[:own], self.offset_rad), points[own:]]))
+        points = raised(sweep.points[: sweep.own], self.offset_rad)
+        if sweep.own < len(sweep.points):
+            points = np.concatenate([points, sweep.points[sweep.own :]])
+        return replace(sweep, points=points)
 
     def reset(self) -> None:
         """Discard the collected scans: the next pose is not connected to theirs."""

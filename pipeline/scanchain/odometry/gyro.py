@@ -89,7 +89,7 @@ class Gyro:
         return _SIGMA_RAD + _SIGMA * float(np.linalg.norm(self.rotation))
 
     def add(self, scan: Scan) -> None:
-        """Add the samples that came with a scan; those of another clock go."""
+        """Add the samples that came with a scan; after a jump of the clock those before are discarded."""
         if scan.clock_jump_s:
             self.blocks.clear()
             self.motions.clear()
@@ -132,7 +132,7 @@ class Gyro:
             self._fit()
 
     def note(self) -> str:
-        """How it was used; empty without samples."""
+        """Share of the scans that it predicts, and how well, as text; empty without samples."""
         if not self.scans:
             return ""
         ours, others = np.degrees(np.sqrt(self.sums / max(self.compared, 1))).tolist()
@@ -142,7 +142,7 @@ class Gyro:
         )
 
     def warnings(self) -> tuple[str, ...]:
-        """Defects of the IMU, a line each."""
+        """Defects of the IMU, one per line."""
         lines = [*self.model.faults] if self.model else []
         lines += [f"{defect} at {counted(count, 'scan')}" for defect, count in self.unusable.items()]
         if self.motions and not self.used:
@@ -196,7 +196,7 @@ class Gyro:
             self.bias_variance *= 1.0 - gain
 
     def _fit(self) -> None:
-        """Estimate the model anew: the delay by the angles alone, axes and bias by least squares."""
+        """Re-estimate the model: the delay from the angles alone, axes and bias by least squares."""
         motions, (times_s, rates) = list(self.motions), self._samples()
         integral = cumulative_trapezoid(rates, times_s, axis=0, initial=0.0)
         ends_s = np.array([(each.begin_s, each.end_s) for each in motions])
@@ -267,9 +267,8 @@ def _axes(X: Matrix, Y: Matrix, stated: Matrix | None) -> Iterator[tuple[Matrix,
         U, S, Vt = np.linalg.svd(H)
         of_rotation = () if stated is None else (turned,)
         if S[1] > _ONE_AXIS * S[0]:
-            flip = np.diag([1.0, 1.0, np.linalg.det(U @ Vt)])
-            inverted = flip @ np.diag([1.0, 1.0, -1.0])
-            candidates += [(U @ flip @ Vt, of_rotation), (U @ inverted @ Vt, (*of_rotation, sign))]
+            R, R_of_opposite = (Rotation.align_vectors(Y, each)[0].as_matrix() for each in (X, -X))
+            candidates += [(R, of_rotation), (-R_of_opposite, (*of_rotation, sign))]
         else:
             candidates.append((Rotation.align_vectors(U[:, :1].T, Vt[:1])[0].as_matrix(), of_rotation))
     for axes, faults in candidates:

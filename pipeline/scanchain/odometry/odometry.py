@@ -311,12 +311,11 @@ class Odometry:
         motion, mean = self.predictor.scan_motion, lie.log(self.predictor.T_previous_current) / prediction.lasted_s
         change = (1.0 - sweep.middle_s / prediction.lasted_s) * (motion.twist - mean)
         change[: self.dimension] = 0.0
-        T_stamp_middle = lie.exp(sweep.middle_s * (mean + change))
-        if motion.turning is not None:
-            T_stamp_middle, change = (
-                lie.inverse(ScanMotion(mean, motion.turning).over(-sweep.middle_s)),
-                0.0 * change,
-            )
+        if motion.turning is None:
+            T_stamp_middle = lie.exp(sweep.middle_s * (mean + change))
+        else:
+            T_stamp_middle = lie.inverse(ScanMotion(mean, motion.turning).over(-sweep.middle_s))
+            change[self.dimension :] = 0.0
         T_middle_stamp = lie.inverse(T_stamp_middle)
         return msgspec.structs.replace(
             tracked,

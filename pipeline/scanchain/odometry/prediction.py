@@ -240,11 +240,11 @@ class Predictor:
         return self.doubtful > _MOST_DOUBTFUL
 
     def warnings(self) -> tuple[str, ...]:
-        """A line on each defect of wheels and IMU; none without any."""
+        """Defects of wheels and IMU, one per line."""
         return self.wheels.warnings() + self.gyro.warnings()
 
     def notes(self) -> tuple[str, ...]:
-        """What was found out about wheels and IMU, a line each."""
+        """Notes on wheels and IMU, one per line."""
         return tuple(filter(None, (self.wheels.mounting.finish(), self.gyro.note())))
 
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:

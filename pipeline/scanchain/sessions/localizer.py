@@ -137,7 +137,7 @@ class Localizer:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about wheel odometry that was rejected."""
+        """Warnings about rejected wheel odometry and defects of an IMU."""
         return self.slam.front_end.odometry.predictor.warnings()
 
     def process(self, scan: Scan | Prepared) -> Placed:

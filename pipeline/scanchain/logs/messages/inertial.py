@@ -16,15 +16,6 @@ class ImuSample(NamedTuple):
     rates: tuple[float, ...]
     accelerations: tuple[float, ...]
 
-    def interpolate(self, later: ImuSample, stamp_ns: int) -> ImuSample:
-        """The sample at a stamp between this one and a later one."""
-        share = (stamp_ns - self.stamp_ns) / (later.stamp_ns - self.stamp_ns)
-        rates, accelerations = (
-            tuple(a + share * (b - a) for a, b in zip(before, after, strict=True))
-            for before, after in ((self.rates, later.rates), (self.accelerations, later.accelerations))
-        )
-        return ImuSample(stamp_ns, self.frame, rates, accelerations)
-
 
 def read_imu(message: Any) -> ImuSample:
     """A sensor_msgs/Imu. Raises MalformedMessageError for values that are not finite."""
