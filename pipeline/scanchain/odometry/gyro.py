@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from scanchain import lie
@@ -80,7 +79,9 @@ class Gyro:
     @property
     def is_used(self) -> bool:
         """True while it predicts the rotations of the last scans better."""
-        ours, others = np.sum(self.errors, axis=0) if len(self.errors) >= _FEWEST else (1.0, 0.0)
+        if len(self.errors) < _FEWEST:
+            return False
+        ours, others = np.sum(self.errors, axis=0)
         return bool(ours < others)
 
     @property
@@ -108,7 +109,7 @@ class Gyro:
     def predict(self, scan: Scan, sweep: Sweep) -> Turning | None:
         """Rotation from the middle of the last scan to the end of this one; None if it is not used."""
         self.now_s = (scan.stamp_ns - self.origin_ns) * 1e-9 + sweep.middle_s
-        self.turning = self._measured(float(np.abs(sweep.times_s).max(initial=0.0)))
+        self.turning = self._measured(sweep) if self.blocks and self.model is not None else None
         if self.turning is not None:
             still = np.zeros(3 if self.size == 1 else 6)
             self.rotation = -lie.log(ScanMotion(still, self.turning).over(self.last_s - self.now_s))[-self.size :]
@@ -117,9 +118,11 @@ class Gyro:
     def correct(self, T_previous_current: Pose | None) -> None:
         """Compare with the motion between the middles of the last scan and this one, None where it is unknown."""
         begin_s, self.last_s = self.last_s, self.now_s
+        if not self.blocks:
+            return
+        self.scans += 1
         self.used += self.is_used and self.turning is not None
-        self.scans += bool(self.blocks)
-        if not self.blocks or T_previous_current is None or not self.now_s > begin_s:
+        if T_previous_current is None or not self.now_s > begin_s:
             return
         motion = Motion(begin_s, self.now_s, lie.log(T_previous_current)[-self.size :])
         if self.turning is not None and self.motions and self.motions[-1].end_s == begin_s:
@@ -149,11 +152,12 @@ class Gyro:
             lines.append("it is not used, since it predicts no rotation better than the scans do")
         return tuple(f"IMU: {line}" for line in lines)
 
-    def _measured(self, half_s: float) -> Turning | None:
-        """Rotation from the middle of the last scan to half a duration after that of this one."""
-        if self.model is None or not self.blocks or math.isnan(self.last_s):
+    def _measured(self, sweep: Sweep) -> Turning | None:
+        """Rotation from the middle of the last scan to the end of this one."""
+        assert self.model is not None
+        if math.isnan(self.last_s):
             return None
-        delay_s = self.model.delay_s
+        half_s, delay_s = float(np.abs(sweep.times_s).max(initial=0.0)), self.model.delay_s
         begin_s, end_s = min(self.last_s, self.now_s - half_s) + delay_s, self.now_s + half_s + delay_s
         times_s, rates = self._samples(begin_s)
         inside = (times_s > begin_s) & (times_s < end_s)
@@ -198,7 +202,8 @@ class Gyro:
     def _fit(self) -> None:
         """Re-estimate the model: the delay from the angles alone, axes and bias by least squares."""
         motions, (times_s, rates) = list(self.motions), self._samples()
-        integral = cumulative_trapezoid(rates, times_s, axis=0, initial=0.0)
+        means = 0.5 * (rates[:-1] + rates[1:])
+        integral = np.cumsum(np.vstack([np.zeros(3), means * np.diff(times_s)[:, None]]), axis=0)
         ends_s = np.array([(each.begin_s, each.end_s) for each in motions])
         rotations, lasted_s = np.array([each.rotation for each in motions]), ends_s[:, 1] - ends_s[:, 0]
 
