@@ -65,9 +65,9 @@ def compile_ahead(kinds: Sequence[str], count: Callable[[int, int], None]) -> bo
 
 @cache
 def _state() -> str:
-    """Hash of all that the compiled code depends on: sources, signatures, versions, processor."""
-    made_by = f"{sys.version} {numba.__version__} {binding.get_host_cpu_name()} {compiling.digest_of_sources()}"
-    return sha256(made_by.encode() + TABLE.read_bytes()).hexdigest()[:16]
+    """Hash of what compiled code depends on, the folder of the sources included, by which Numba caches."""
+    parts = sys.version, numba.__version__, binding.get_host_cpu_name(), compiling.digest_of_sources(), str(TABLE)
+    return sha256(repr(parts).encode() + TABLE.read_bytes()).hexdigest()[:16]
 
 
 def _compile_all(kinds: Sequence[str], cores: int, count: Callable[[int, int], None]) -> bool:

@@ -62,7 +62,7 @@ def poisoned(tmp_path, monkeypatch):
     """Interpreters in which two of the logs crash the process, or eat its memory."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(POISON)
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path / 'site'}:{ROOT}")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path / 'site'}:{ROOT}", prepend=os.pathsep)
 
 
 @pytest.fixture

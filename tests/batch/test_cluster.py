@@ -31,7 +31,7 @@ class Watching:
 def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     for name, value in (("period_ms", 1000), ("timeout_ms", 2000), ("failure_threshold", 2)):
         monkeypatch.setenv(f"RAY_health_check_{name}", str(value))  # a dead node is noticed within seconds

@@ -70,7 +70,7 @@ def test_turns_outside_of_the_window_are_contradicted_and_not_lost(row, override
 
 
 def test_wheels_hold_the_poses_along_corridors_that_a_short_range_leaves_degenerate(tmp_path):
-    log = made.log("identical", seconds=120)  # of the 300 s of the page
+    log = made.log("identical", seconds=90)  # of the 300 s of the page
     without, with_wheels = (
         metrics_of(log, tmp_path / prior, preprocess__max_range_m=4.0, odometry__prior=prior)
         for prior in ("constant-velocity", "auto")

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from time import sleep
 
 import pytest
@@ -13,6 +14,7 @@ from scanchain import ahead
 from scanchain.__main__ import main
 from scanchain.clock import compiled_s, working_s
 from scanchain.commands.terminal import Terminal
+from scanchain.kernels import compiling
 from tests.support import made
 from tests.support.signatures import words_of
 
@@ -40,6 +42,8 @@ class Fake:
 
 @pytest.fixture
 def faked(tmp_path, monkeypatch):
+    for each in ahead.signatures():  # a module that is imported later would keep its kernels in this folder
+        ahead._named(each.kernel)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(ahead, "_Worker", Fake)
     monkeypatch.setattr(Fake, "told", [], raising=False)
@@ -78,6 +82,13 @@ def test_what_is_known_to_be_compiled_changes_with_the_sources_and_versions(fake
     monkeypatch.setattr(ahead, "_state", lambda: "another")
     faked.told.clear()
     assert compiled() and faked.told
+
+
+def test_another_installation_of_the_same_sources_is_not_taken_for_compiled(tmp_path, monkeypatch):
+    here = ahead._state.__wrapped__()
+    monkeypatch.setattr(ahead, "TABLE", tmp_path / "signatures.json")
+    ahead.TABLE.write_bytes(Path(compiling.__file__).with_name("signatures.json").read_bytes())
+    assert ahead._state.__wrapped__() != here  # numba looks for its kernels in another folder
 
 
 def test_where_a_process_ends_early_or_nothing_can_be_kept_calls_compile_what_they_need(

@@ -137,7 +137,7 @@ def at_its_fit(voxel_map, points):
 @pytest.mark.parametrize("twist", [np.eye(6)[0], np.eye(6)[4], np.array([0.3, -0.2, 0.5, 0.02, -0.1, 0.05])])
 @pytest.mark.parametrize("scans", [1, 2, BEFORE])
 def test_the_signal_is_that_of_its_slow_twin(twist, scans):
-    voxel_map, points = map_of(200, scans), walls(99, 30)[::5]
+    voxel_map, points = map_of(200, scans), walls(99, 30)[::5].copy()
     voxel_map.insert(points + np.array([0.0, 0.0, 0.4]), lie.identity(3))  # voxels that are young
     problem, T, _ = at_its_fit(voxel_map, points)
     found = observability.signal_along(problem, T, twist)

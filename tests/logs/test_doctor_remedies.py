@@ -36,7 +36,7 @@ def stamp_of(data):
 
 
 def town():
-    return made.log("town", seconds=20, sensor="vlp-16")
+    return made.log("town", seconds=15, sensor="vlp-16")
 
 
 def a_gap():
@@ -52,7 +52,20 @@ FAULTS = {
 
 def figures(path, out, capfd, *flags):
     """Error of the odometry in meters, infinite where the run stops."""
-    words = ["run", path, "--out", out, "--rerun", "off", "--no-loops", "--force", "--json", *flags]
+    words = [
+        "run",
+        path,
+        "--out",
+        out,
+        "--rerun",
+        "off",
+        "--no-loops",
+        "--error-bars",
+        "quick",
+        "--force",
+        "--json",
+        *flags,
+    ]
     code = main([str(word) for word in words])
     output = capfd.readouterr().out
     if code and not output.startswith("{"):

@@ -133,15 +133,15 @@ def carried(slam, scans, first, last):
 @pytest.mark.slow
 def test_a_robot_that_was_carried_elsewhere_is_found_again():
     log = open_log(shared_data("2d/intel.mcap"))
-    scans = list(islice(log.scans(), 8000))
+    scans = list(islice(log.scans(), 5600))
     whole, none = carried(Slam(configured(2), log.T_base_lidar), scans, 0, 0)
     slam = Slam(configured(2), log.T_base_lidar)
     holed, starts = carried(slam, scans, 4000, 4600)
     before, after = (ate_m(trajectory, whole.trajectory) for trajectory in (holed.odometry, holed.trajectory))
     assert len(slam.back_end.closer.segments.starts) == 2
     assert none == [] and starts == [4600]
-    assert before > 5.0
-    assert after < 0.5
+    assert before > 3.0
+    assert after < 0.1
     across = [
         item.proposed_by
         for item in final_verdicts(holed.closures, holed.state)

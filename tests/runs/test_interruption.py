@@ -29,15 +29,15 @@ from tests.support.recordings import column
 from tests.support.scenes import ROOT, configured, shared_data
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else half a minute has no closures
+LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else 20 s have no closures
 RECORDED = (*LOOPING, "--checkpoint", "0.2", "--error-bars", "quick")
 LIVELY = (*RECORDED, "--rerun", "off")
 
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
-    """Half a minute in the simulated office, 300 scans."""
-    return made.log("office", tmp_path_factory.mktemp("log"), seconds=30)
+    """Twenty seconds in the simulated office, 200 scans."""
+    return made.log("office", tmp_path_factory.mktemp("log"), seconds=20)
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_sa
 @pytest.mark.slow
 def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(office, whole, tmp_path):
     out = tmp_path / "run"
-    left_after(100, office, out, *RECORDED)
+    left_after(80, office, out, *RECORDED)
     words = ["run", str(office), "--out", str(out), *RECORDED, "--resume"]
     for module, kind, method in (
         ("scanchain_viz.recording.recording", "Recording", "resume"),
@@ -133,7 +133,7 @@ def dying(self, *values):
 @pytest.mark.slow
 def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(office, whole, tmp_path):
     out = tmp_path / "run"
-    left_after(150, office, out, *LIVELY)
+    left_after(90, office, out, *LIVELY)
     assert killing.start(office, out, *RECORDED, "--resume").wait() == 0
     assert "the recording begins there" in (out / "summary.txt").read_text()
     assert "the recording lacks something" not in (out / "summary.txt").read_text()
@@ -144,7 +144,7 @@ def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(off
 @pytest.mark.parametrize(
     "name, count, changes",
     [
-        ("office", 300, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0}),
+        ("office", 200, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0}),
         ("2d/intel.mcap", 200, {"matching.matcher": "svd", "loops.enabled": False}),
         ("3d/kitti_0001_first54.mcap", 54, {"loops.min_travel_m": 3.0, "loops.place_radius_m": 4.0}),
     ],
@@ -214,7 +214,7 @@ def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(office, tmp_path):
     assert child.returncode == 1 and errors.count("\n") == 1 and "PARTIAL" in output
     assert errors.startswith("error: stopped by the user after ") and str(killing.partial(out)) in errors
     assert errors.endswith(f"to resume: scanchain run {office} --out {out} {' '.join(RECORDED)} --resume\n")
-    assert 30 <= killing.assert_readable(killing.partial(out)) < 300
+    assert 30 <= killing.assert_readable(killing.partial(out)) < 200
 
 
 @pytest.mark.slow

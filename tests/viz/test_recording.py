@@ -275,7 +275,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
 print(record(Path(sys.argv[1]), drive(100, 3, points=8000), 3).warnings)
 """
     command = [sys.executable, "-c", script, str(tmp_path / "a.rrd")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"}
     told = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=True).stdout
     assert told.count("is incomplete, the run goes on without it") == 1
 

@@ -401,10 +401,14 @@ def _eigenvalues(points: Points) -> Matrix:
     d = points.shape[1]
     queries = points[:: max(1, len(points) // MAX_QUERIES)]
     tree = KDTree(points)
-    result = np.full((len(queries), d), np.nan)
+    covariances = np.full((len(queries), d, d), np.nan)
     for begin in range(0, len(queries), _AT_ONCE):  # all neighbors of all queries take gigabytes
         some = queries[begin : begin + _AT_ONCE]
         for row, chosen in enumerate(tree.query_ball_point(some, RADIUS_M[d], return_sorted=False), begin):
             if len(chosen) >= MIN_NEIGHBORS:
-                result[row] = np.linalg.eigvalsh(np.cov(points[chosen].T))
+                offsets = points[chosen] - queries[row]
+                offsets -= offsets.mean(axis=0)
+                covariances[row] = offsets.T @ offsets / (len(chosen) - 1)
+    result, known = np.full((len(queries), d), np.nan), np.isfinite(covariances[:, 0, 0])
+    result[known] = np.linalg.eigvalsh(covariances[known])
     return result
