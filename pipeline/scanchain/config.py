@@ -66,8 +66,8 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     odometry_topic : wheel odometry, ``nav_msgs/Odometry``, stamped poses, or transforms with odom → base_link;
         found automatically where empty
     ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
-    imu_topic : IMU, ``sensor_msgs/Imu``, whose gyro is used where it predicts rotations better than the scans;
-        found automatically where empty, ``none`` leaves it unused
+    imu_topic : IMU, ``sensor_msgs/Imu``, used where it predicts motions better than the scans; found
+        automatically where empty, ``none`` leaves it unused
     upside_down : whether a planar lidar hangs upside down although no transform says so: its scans are mirrored
     start_s : everything before this time, counted from the first message, is skipped
     end_s : everything after this time, counted from the first message, is skipped
@@ -190,7 +190,7 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
     """Motion prediction, search width after a failed match, and spacing of keyframes.
 
     prior : motion prediction: by wheel odometry, at constant velocity, or by the wheels where the log has them
-    imu : whether the gyro of an IMU is used, where it predicts rotations better than the scans do
+    imu : whether an IMU is used, where it predicts motions better than the scans do
     wheel_sigma_m : largest standard deviation of a translation predicted by the wheels; the usual one is
         estimated while running
     wheel_sigma_rad : the same for a rotation

@@ -93,13 +93,13 @@ class Inertial(NamedTuple):
     stamps_ns : (M,) ascending, by the clock of the scans
     rates : (M, 3) rad/s
     accelerations : (M, 3) m/s², at rest 9.8 upwards
-    R_lidar_imu : (3, 3) rotation from the frame of both to that of the lidar; None where it is unknown
+    T_lidar_imu : (4, 4) pose of the IMU in the lidar's frame; None where it is unknown
     """
 
     stamps_ns: Integers
     rates: Matrix
     accelerations: Matrix
-    R_lidar_imu: Matrix | None = None
+    T_lidar_imu: Pose | None = None
 
     def checked(self) -> Inertial:
         """The same, converted if nothing is lost. Raises InputError for any other shape, dtype or value."""
@@ -112,11 +112,9 @@ class Inertial(NamedTuple):
             checks.matrices(getattr(self, name), f"inertial.{name}", (len(stamps_ns), 3))
             for name in ("rates", "accelerations")
         )
-        R = self.R_lidar_imu
-        R = None if R is None else checks.matrices(R, "inertial.R_lidar_imu", (3, 3))
-        if R is not None and not np.abs(R @ R.T - np.eye(3)).max() <= checks.RIGID:
-            raise InputError("inertial.R_lidar_imu is not a rotation; wanted RᵀR = I")
-        return Inertial(stamps_ns, rates, accelerations, R)
+        T = self.T_lidar_imu
+        T = None if T is None else checks.pose(T, "inertial.T_lidar_imu", 3)
+        return Inertial(stamps_ns, rates, accelerations, T)
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +166,7 @@ class Scan:
         if self.origin is not None:
             _set(self, "origin", checks.matrices(self.origin, "origin", (d,)))
         if self.inertial is not None:
-            wanted = "Inertial(stamps_ns, rates, accelerations, R_lidar_imu)"
+            wanted = "Inertial(stamps_ns, rates, accelerations, T_lidar_imu)"
             checks.instance(self.inertial, Inertial, "inertial", wanted)
             _set(self, "inertial", self.inertial.checked())
         if self.T_odom_base is not None:

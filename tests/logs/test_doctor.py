@@ -254,7 +254,7 @@ def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_
         "GNSS /fix: not used",
         "poses /gps: not used; --gt /gps uses them as ground truth, --log.odometry_topic /gps as wheels",
         "ground truth /ground_truth: evaluates the result, is not used for it",
-        "IMU /imu/data: its gyro predicts rotations where it does so better than the scans",
+        "IMU /imu/data: predicts motions where it does so better than the scans",
     ]
     assert all(f"sensor    {line}\n" in text for line in lines)
     assert "wheels    /odom" in text and "/odom:" not in text

@@ -33,11 +33,11 @@ def with_more(log, folder, topics, **fields):
     return [log, path]
 
 
-def test_the_only_imu_is_found_with_its_rotation_on_the_lidar(log):
+def test_the_only_imu_is_found_with_its_pose_on_the_lidar(log):
     opened = scanchain.open_log(log)
     assert opened.imu.topic == "/imu/data"
     expected = lie.inverse(opened.mounting.T_base_lidar) @ IMUS["mems"].T_base_imu
-    np.testing.assert_allclose(opened.imu.R_lidar_imu, expected[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(opened.imu.T_lidar_imu, expected, atol=1e-9)
 
 
 def test_scans_have_all_samples_in_order_each_once_to_their_end(log):
@@ -79,18 +79,18 @@ def test_of_several_none_is_used_until_one_is_chosen(log, tmp_path):
 
 def test_without_a_transform_its_rotation_is_unknown_and_in_the_lidars_own_frame_none_is_needed(log, tmp_path):
     elsewhere = with_more(log, tmp_path, ["/a"], frame="unknown")
-    assert scanchain.open_log(elsewhere, imu_topic="/a").imu.R_lidar_imu is None
+    assert scanchain.open_log(elsewhere, imu_topic="/a").imu.T_lidar_imu is None
     (tmp_path / "own").mkdir()
     own = with_more(log, tmp_path / "own", ["/a"], frame="lidar")
-    np.testing.assert_array_equal(scanchain.open_log(own, imu_topic="/a").imu.R_lidar_imu, np.eye(3))
+    np.testing.assert_array_equal(scanchain.open_log(own, imu_topic="/a").imu.T_lidar_imu, np.eye(4))
 
 
 def test_that_of_a_planar_lidar_upside_down_is_as_seen_from_above():
     planar = made.log("office", seconds=3.0, imu="mems")
     usual, mirrored = (
-        next(iter(scanchain.open_log(planar, upside_down=each))).inertial.R_lidar_imu for each in (False, True)
+        next(iter(scanchain.open_log(planar, upside_down=each))).inertial.T_lidar_imu for each in (False, True)
     )
-    np.testing.assert_allclose(mirrored, np.diag([1.0, -1.0, -1.0]) @ usual)
+    np.testing.assert_allclose(mirrored, np.diag([1.0, -1.0, -1.0, 1.0]) @ usual)
 
 
 def test_a_sample_that_is_not_finite_is_left_out_and_counted(log, tmp_path):
@@ -113,11 +113,11 @@ def test_a_sample_that_is_not_finite_is_left_out_and_counted(log, tmp_path):
         ({"stamps_ns": np.array([0.1, 0.2])}, "inertial.stamps_ns holds float64"),
         ({"rates": np.zeros((3, 3))}, r"inertial.rates .* \(2, 3\)"),
         ({"accelerations": np.full((2, 3), np.nan)}, "inertial.accelerations holds NaN"),
-        ({"R_lidar_imu": 2.0 * np.eye(3)}, "inertial.R_lidar_imu is not a rotation"),
+        ({"T_lidar_imu": 2.0 * np.eye(4)}, "inertial.T_lidar_imu is not a rigid transformation"),
     ],
 )
 def test_samples_given_in_python_are_checked(changed, words):
-    sound = scanchain.Inertial(np.array([1, 2]), np.zeros((2, 3)), np.zeros((2, 3)), np.eye(3))
+    sound = scanchain.Inertial(np.array([1, 2]), np.zeros((2, 3)), np.zeros((2, 3)), np.eye(4))
     assert scanchain.Scan.of(np.ones((5, 3)), 1.0, inertial=sound).inertial.rates.shape == (2, 3)
     with pytest.raises(InputError, match=words):
         scanchain.Scan.of(np.ones((5, 3)), 1.0, inertial=sound._replace(**changed))
@@ -126,5 +126,5 @@ def test_samples_given_in_python_are_checked(changed, words):
 def test_info_says_what_it_is_used_for(log):
     said = describe([log], load_settings(3).config.log)["sensors"]
     assert [each.use for each in said if each.sensor == "IMU"] == [
-        "its gyro predicts rotations where it does so better than the scans"
+        "predicts motions where it does so better than the scans"
     ]

@@ -60,7 +60,8 @@ def drive(
         rates = np.clip(rates + BIAS + 0.001 * random.normal(size=rates.shape), -limit, limit) @ axes
         rates = rates * 0.0 + BIAS if is_frozen else rates
         stamps_ns = np.round(1e9 * stamps_s).astype(np.int64) + 10**18
-        inertial = Inertial(stamps_ns, rates, np.zeros_like(rates), stated)
+        T = None if stated is None else np.block([[stated, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+        inertial = Inertial(stamps_ns, rates, np.zeros_like(rates), T)
         points, times_s = 5.0 * np.array([np.ones(dimension), -np.ones(dimension)]), np.array([0.0, SCAN_S])
         scan = Scan.of(points, 1e9 + stamp_s, times_s, index=k, inertial=inertial)
         gyro.add(scan)
@@ -160,7 +161,7 @@ def test_after_a_jump_of_the_clock_it_goes_on_with_new_samples():
     gyro = Gyro(3)
     drive(gyro)
     stamps_ns = np.arange(10**9, 10**9 + 10**8, 5_000_000)
-    inertial = Inertial(stamps_ns, np.zeros((20, 3)), np.zeros((20, 3)), ALIGNED)
+    inertial = Inertial(stamps_ns, np.zeros((20, 3)), np.zeros((20, 3)), np.eye(4))
     scan = Scan.of(np.ones((2, 3)), 1.0, np.array([0.0, SCAN_S]), index=80, inertial=inertial)
     gyro.add(replace(scan, clock_jump_s=-1e9))
     assert [len(times_s) for times_s, _ in gyro.blocks] == [20]

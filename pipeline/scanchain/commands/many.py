@@ -157,7 +157,7 @@ def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_
     Methods:
       plicp, svd               ours, odometry only
       plicp+loops, svd+loops   ours, with loop closures
-      plicp+imu, svd+imu       ours, with the gyro of the log's IMU
+      plicp+imu, svd+imu       ours, with the log's IMU
       CLASS, CLASS+loops, CLASS+imu    ours with the matcher of --matcher MODULE:CLASS
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only

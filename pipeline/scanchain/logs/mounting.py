@@ -10,7 +10,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import NO_TOPIC, LogConfig
-from scanchain.data import Matrix, Pose
+from scanchain.data import Pose
 from scanchain.errors import InputError
 from scanchain.logs.index import Channel, FileIndex, name_of
 from scanchain.logs.messages.inertial import ImuSample
@@ -118,11 +118,11 @@ def find_wheels(
 
 
 class Imu(NamedTuple):
-    """An IMU: topic, reader of its messages, and rotation (3, 3); None where the log does not state it."""
+    """An IMU: topic, reader of its messages, and pose (4, 4); None where the log does not state it."""
 
     topic: str
     read: Read
-    R_lidar_imu: Matrix | None
+    T_lidar_imu: Pose | None
 
 
 def find_imu(indexes: Sequence[FileIndex], wanted: str, frame: str, span: Span, notes: list[str]) -> Imu | None:
@@ -148,7 +148,7 @@ def _imu_of(indexes: Sequence[FileIndex], channel: Channel, frame: str, span: Sp
     first = next(sampled_messages(indexes, channel.topic, read), None)
     own = first.value.frame if first is not None and isinstance(first.value, ImuSample) else ""
     T = np.eye(4) if own and own == frame else between_frames(indexes, span, frame, own) if own and frame else None
-    return Imu(channel.topic, read, None if T is None else T[:3, :3])
+    return Imu(channel.topic, read, T)
 
 
 class MovingFrame(NamedTuple):

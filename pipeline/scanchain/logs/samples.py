@@ -93,9 +93,9 @@ class Recorded:
     ) -> None:
         """is_mirrored : whether a planar lidar hangs upside down; its frame is then as seen from above."""
         self.odometry, self.imu = SampleStream[StampedPose](), SampleStream[ImuSample]()
-        self.R_lidar_imu = None if imu is None else imu.R_lidar_imu
-        if self.R_lidar_imu is not None and is_mirrored:
-            self.R_lidar_imu = np.diag([1.0, -1.0, -1.0]) @ self.R_lidar_imu
+        self.T_lidar_imu = None if imu is None else imu.T_lidar_imu
+        if self.T_lidar_imu is not None and is_mirrored:
+            self.T_lidar_imu = np.diag([1.0, -1.0, -1.0, 1.0]) @ self.T_lidar_imu
         self._given_ns = 0  # stamp of the last sample that a scan has
         named = {odometry_topic: self.odometry, "" if imu is None else imu.topic: self.imu}
         self.streams: dict[str, SampleStream[Any]] = {topic: stream for topic, stream in named.items() if topic}
@@ -134,7 +134,7 @@ class Recorded:
         self._given_ns = found[-1].stamp_ns
         stamps_ns = np.array([each.stamp_ns for each in found], np.int64)
         rates, accelerations = np.array([(each.rates, each.accelerations) for each in found]).swapaxes(0, 1)
-        return Inertial(stamps_ns, rates, accelerations, self.R_lidar_imu)
+        return Inertial(stamps_ns, rates, accelerations, self.T_lidar_imu)
 
     def ground_truth(self, lidar_on: Callable[[str], Pose]) -> Trajectory | None:
         """True poses of the lidar so far; None if there are none.

@@ -101,7 +101,7 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str, imu:
             found.append(OtherSensor("ground truth", topic, "evaluates the result, is not used for it"))
         elif role(channel) == "imu":
             use = (
-                "its gyro predicts rotations where it does so better than the scans"
+                "predicts motions where it does so better than the scans"
                 if topic == imu
                 else "not used"
             )

@@ -62,12 +62,14 @@ class Gyro:
     def __init__(self, dimension: int) -> None:
         self.size = 1 if dimension == 2 else 3
         self.stated: Matrix | None = None  # axes (r, 3) by the log's transforms
+        self.p_lidar_imu = np.zeros(3)
         self.model: Model | None = None
         self.origin_ns = 0
         self.last_s = self.now_s = math.nan  # middles of the last two scans
         self.turning: Turning | None = None
         self.rotation = np.zeros(self.size)  # from one to the other
-        self.blocks: deque[tuple[Vector, Matrix]] = deque(maxlen=_SCANS)  # times (M,) and rates (M, 3) by scan
+        self.forces = np.empty((0, 3))  # specific forces at the knots of ``turning``, along the IMU's axes
+        self.blocks: deque[tuple[Vector, Matrix]] = deque(maxlen=_SCANS)  # times (M,); rates and forces (M, 6)
         self.motions: deque[Motion] = deque(maxlen=_SCANS)
         self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared: of the gyro, of equal motion
         self.count, self.compared, self.next_fit = 0, 0, float(_FIRST_FIT)
@@ -101,9 +103,9 @@ class Gyro:
         times_s = 1e-9 * (found.stamps_ns - self.origin_ns).astype(np.float64)
         new = times_s > self.blocks[-1][0][-1] if self.blocks else np.ones(len(times_s), bool)
         if new.any():
-            self.blocks.append((times_s[new], found.rates[new]))
-        if self.model is None and found.R_lidar_imu is not None:
-            self.stated = found.R_lidar_imu[-self.size :]
+            self.blocks.append((times_s[new], np.hstack([found.rates, found.accelerations])[new]))
+        if self.model is None and found.T_lidar_imu is not None:
+            self.stated, self.p_lidar_imu = found.T_lidar_imu[3 - self.size : 3, :3], found.T_lidar_imu[:3, 3]
             self.model = Model(self.stated, np.zeros(self.size))
 
     def predict(self, scan: Scan, sweep: Sweep) -> Turning | None:
@@ -134,6 +136,20 @@ class Gyro:
             self.next_fit = _FITS * self.count
             self._fit()
 
+    def forces_since_last(self) -> tuple[Vector, Matrix, Matrix]:
+        """Times (K,) from the middle of the last scan to that of this one, at 0, rotations and specific forces.
+
+        Rotations R_last_t (K, 3, 3); forces (K, 3) in m/s² along the axes of the lidar: those of the gyro, without
+        its unit and sign.
+        """
+        assert self.turning is not None and self.model is not None
+        times_s, poses = self.turning.poses(np.zeros(3))
+        knots_s, begin_s = self.turning.knots_s, self.last_s - self.now_s
+        wanted_s = np.concatenate([[begin_s], knots_s[(knots_s > begin_s) & (knots_s < 0.0)], [0.0]])
+        R = _interpolated(wanted_s, times_s, poses[:, :3, :3].reshape(-1, 9)).reshape(-1, 3, 3)
+        axes = self.model.axes / np.cbrt(np.linalg.det(self.model.axes))
+        return wanted_s, R[0].T @ R, _interpolated(wanted_s, knots_s, self.forces) @ axes.T
+
     def note(self) -> str:
         """Share of the scans that it predicts, and how well, as text; empty without samples."""
         if not self.scans:
@@ -159,7 +175,8 @@ class Gyro:
             return None
         half_s, delay_s = float(np.abs(sweep.times_s).max(initial=0.0)), self.model.delay_s
         begin_s, end_s = min(self.last_s, self.now_s - half_s) + delay_s, self.now_s + half_s + delay_s
-        times_s, rates = self._samples(begin_s)
+        times_s, samples = self._samples(begin_s)
+        rates = samples[:, :3]
         inside = (times_s > begin_s) & (times_s < end_s)
         knots_s = np.concatenate([[begin_s], times_s[inside], [end_s]])
         if not end_s > begin_s:
@@ -167,8 +184,9 @@ class Gyro:
         if defect := _defect(knots_s, rates[inside]):
             self.unusable[defect] += 1
             return None
-        at_knots = np.column_stack([np.interp(knots_s, times_s, each) for each in rates.T])
-        means = 0.5 * (at_knots[:-1] + at_knots[1:])
+        at_knots = _interpolated(knots_s, times_s, samples)
+        self.forces = at_knots[:, 3:]
+        means = 0.5 * (at_knots[:-1, :3] + at_knots[1:, :3])
         return Turning(knots_s - delay_s - self.now_s, means @ self.model.axes.T - self.model.bias)
 
     def _samples(self, begin_s: float = -math.inf) -> tuple[Vector, Matrix]:
@@ -202,6 +220,7 @@ class Gyro:
     def _fit(self) -> None:
         """Re-estimate the model: the delay from the angles alone, axes and bias by least squares."""
         motions, (times_s, rates) = list(self.motions), self._samples()
+        rates = rates[:, :3]
         means = 0.5 * (rates[:-1] + rates[1:])
         integral = np.cumsum(np.vstack([np.zeros(3), means * np.diff(times_s)[:, None]]), axis=0)
         ends_s = np.array([(each.begin_s, each.end_s) for each in motions])
@@ -247,6 +266,16 @@ class Gyro:
         squares = np.sum(weights * a * a, axis=1) * np.sum(weights * b * b, axis=1)
         correlation = np.sum(weights * a * b, axis=1) / np.sqrt(np.maximum(squares, 1e-24))
         return float(delays_s[np.argmax(np.where(2 * known.sum(axis=1) >= len(rotations), correlation, -1.0))])
+
+
+def _interpolated(at_s: Vector, times_s: Vector, values: Matrix) -> Matrix:
+    """Values (M, n) at times (M,), interpolated at others (K,): (K, n); beyond the ends those of the ends."""
+    after = np.clip(np.searchsorted(times_s, at_s), 1, max(len(times_s) - 1, 1))
+    if len(times_s) == 1:
+        return np.repeat(values, len(at_s), axis=0)
+    before_s = times_s[after - 1]
+    share = np.clip((at_s - before_s) / (times_s[after] - before_s), 0.0, 1.0)[:, None]
+    return values[after - 1] * (1.0 - share) + values[after] * share
 
 
 def _typical(rotations: Matrix) -> float:

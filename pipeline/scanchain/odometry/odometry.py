@@ -18,7 +18,7 @@ from scanchain.growing_array import read_only
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
-from scanchain.odometry.prediction import Prediction, Predictor
+from scanchain.odometry.prediction import Prediction, Predictor, Source
 from scanchain.odometry.recovery import CLEARLY, Recovery, is_sound
 from scanchain.odometry.standstill import Standstill
 from scanchain.preprocess import Prepared, Resolution, ScanMotion, Sweep, prepare
@@ -227,7 +227,7 @@ class Odometry:
         usual_cost = self.recovery.usual_cost
         match, rival = self.recovery.align(points, sweep, self.local_map, prediction)
         is_placed = match.inlier_share >= self.config.matching.min_inlier_share
-        may_stand = self.dimension == 3 and not prediction.source.is_measured
+        may_stand = self.dimension == 3 and prediction.source is not Source.WHEELS
         if is_placed and may_stand and self.standstill.confirms(match):
             match = replace(match, T_target_source=self.standstill.T_odom_lidar)
             return _Registered(points, match, self._judge(match), prediction, is_standing=True)

@@ -11,21 +11,24 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import OdometryConfig
-from scanchain.data import LEAST_FIT, Match, Pose, Prior, Scan, State
+from scanchain.data import LEAST_FIT, Match, Matrix, Pose, Prior, Scan, State
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
+from scanchain.odometry.accelerometer import Accelerometer
 from scanchain.odometry.gyro import Gyro
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import ErrorStatistics, MotionFilter
 from scanchain.odometry.wheels import Wheels
 from scanchain.preprocess import ScanMotion, Sweep
 
+_CERTAIN = 5.0  # largest standard deviations within which the pose is that an IMU predicts
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps are too close
 _LARGEST_WINDOW_M = 5.0  # largest half width of the search window
 _ACCELERATION_M_S2 = 4.0  # of a car; limits the search window around the predicted pose in space
 _FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
+_LEAST_M = 0.05  # least of the largest standard deviations of a translation by an IMU
 _BURST = 0.05  # of the usual interval: a shorter one is due to a burst and gives no velocity
 _JUMP = 1.0  # m and rad, difference of two motions per scan, above which the wheels may have jumped
 _LEAST_TURN = 0.3  # of a rotation in the worst direction of a scan, a unit twist, that leaves the rotation open
@@ -37,13 +40,19 @@ class Source(StrEnum):
     """Source of the predicted motion to a scan."""
 
     CONSTANT_VELOCITY = "constant velocity"
+    IMU = "IMU"  # rotation by its gyro, translation by its accelerometer
     GYRO = "gyro"  # the rotation; the translation at constant velocity
     WHEELS = "wheels"
 
     @property
     def is_measured(self) -> bool:
         """True if a sensor other than the lidar measures the whole motion."""
-        return self is Source.WHEELS
+        return self in (Source.WHEELS, Source.IMU)
+
+    @property
+    def turns(self) -> bool:
+        """True if a gyro measures the rotation."""
+        return self in (Source.GYRO, Source.IMU)
 
 
 class Prediction(msgspec.Struct, frozen=True):
@@ -119,6 +128,10 @@ class Prediction(msgspec.Struct, frozen=True):
         """
         elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
         half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi)
+        if self.source.turns:
+            half_width_rad = _CERTAIN * float(self.prior.widest[-1])
+        if self.source is Source.IMU:
+            return ((_CERTAIN * float(self.prior.widest[:3].max()), half_width_rad),)
         if len(self.T_odom_last) == 3:
             half_width_m = min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M)
             return ((half_width_m, half_width_rad),)
@@ -129,7 +142,7 @@ class Prediction(msgspec.Struct, frozen=True):
         return by_acceleration, by_speed
 
     def alternatives(self) -> tuple[Pose, ...]:
-        """Other initial poses.
+        """Other initial poses within the search window.
 
         The last motion again, the same velocity over 0.5, 1 and 1.5 times the interval by the stamps, and no
         motion.
@@ -137,7 +150,15 @@ class Prediction(msgspec.Struct, frozen=True):
         T = self.T_odom_last
         moving = (self.T_previous_current, self.interval_s, self.last_s, self.usual_s)
         scaled = tuple(T @ _motion_over(*moving, share=share) for share in (0.5, 1.0, 1.5))
-        return T @ self.T_previous_current, *scaled, T
+        return tuple(filter(self.is_possible, (T @ self.T_previous_current, *scaled, T)))
+
+    def is_possible(self, T: Pose) -> bool:
+        """True if a pose is within the search window, where an IMU measures the motion; else always."""
+        if not self.source.turns:
+            return True
+        half_width_m, half_width_rad = self.windows()[-1]
+        away_m, away_rad = lie.apart(self.T_odom_lidar, T)
+        return away_m < half_width_m and away_rad < half_width_rad
 
     def scan_motion_by(self, motion: NDArray[np.float64]) -> ScanMotion:
         """Motion during a scan after this motion (k,) to it; that of the last one if stamps do not increase.
@@ -183,10 +204,10 @@ class Predictor:
         k = lie.twist_size(T_base_lidar)
         self.scan_motion = ScanMotion(np.zeros(k))
         self.wheels = Wheels(config, T_base_lidar, is_mounted=is_mounted)
-        self.gyro = Gyro(len(T_base_lidar) - 1)
+        self.gyro, self.accelerometer = Gyro(len(T_base_lidar) - 1), Accelerometer()
         sigma = lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad)
         self.statistics = {Source.WHEELS: self.wheels.statistics}
-        self.statistics |= {source: ErrorStatistics(sigma) for source in Source if not source.is_measured}
+        self.statistics |= {source: ErrorStatistics(sigma) for source in Source if source is not Source.WHEELS}
         self.filter = MotionFilter(np.diag(sigma**2))
         self.intervals = Intervals()
         self.lost_s = 0.0
@@ -195,6 +216,7 @@ class Predictor:
     def predict(self, scan: Scan, sweep: Sweep, *, by_wheels: bool = True) -> Prediction:
         """The predicted pose, at its middle, of a scan that follows the last one corrected."""
         times, turning = self.intervals, self.gyro.predict(scan, sweep)
+        self.accelerometer.predict(self.T_odom_lidar, self.gyro)
         interval_s = times.to(scan)
         wheel = self.wheels.motion(scan) if by_wheels and times.last_scan is not None else None
         source, is_guess, jump_m = Source.CONSTANT_VELOCITY if wheel is None else Source.WHEELS, False, 0.0
@@ -204,6 +226,8 @@ class Predictor:
             scans = max(interval_s / times.usual_s, 1.0) if times.usual_s else 1.0
             if largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
                 jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
+        elif turning is not None and self.accelerometer.is_used:
+            source, motion, covariance = Source.IMU, *self._by_imu()
         elif times.is_gap(interval_s):
             motion = _motion_over(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, is_guess = self.filter.any_motion, True
@@ -214,9 +238,11 @@ class Predictor:
             noise = self.statistics[source].covariance
             motion, covariance = self.filter.motion, self.filter.predicted(noise)[0]
         widest = self.statistics[source].first_sigma
-        if source is Source.GYRO:
+        if source.turns:
             widest = widest.copy()
             widest[-self.gyro.size :] = self.gyro.sigma_rad
+        if source is Source.IMU:
+            widest[:3] = np.minimum(widest[:3], _LEAST_M + _CERTAIN * np.sqrt(np.diag(covariance)[:3]))
         T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(
             prior=Prior(T_predicted, covariance, widest, is_measured=source.is_measured),
@@ -234,6 +260,15 @@ class Predictor:
             config=self.config,
         )
 
+    def _by_imu(self) -> tuple[Pose, Matrix]:
+        """T_previous_current and its covariance (6, 6)."""
+        away, sigma_rad = self.accelerometer.position - self.T_odom_lidar[:3, 3], self.gyro.sigma_rad
+        motion = lie.exp(np.concatenate([np.zeros(3), self.gyro.rotation]))
+        motion[:3, 3] = self.T_odom_lidar[:3, :3].T @ away
+        covariance = sigma_rad**2 * np.eye(6)
+        covariance[:3, :3] = self.accelerometer.covariance
+        return motion, covariance
+
     @property
     def doubts_scans(self) -> bool:
         """True if most of the last scans were lost or contradicted, or one jumped: they cannot refute wheels."""
@@ -241,15 +276,16 @@ class Predictor:
 
     def warnings(self) -> tuple[str, ...]:
         """Defects of wheels and IMU, one per line."""
-        return self.wheels.warnings() + self.gyro.warnings()
+        return self.wheels.warnings() + self.gyro.warnings() + self.accelerometer.warnings()
 
     def notes(self) -> tuple[str, ...]:
         """Notes on wheels and IMU, one per line."""
-        return tuple(filter(None, (self.wheels.mounting.finish(), self.gyro.note())))
+        return tuple(filter(None, (self.wheels.mounting.finish(), self.gyro.note(), self.accelerometer.note())))
 
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Update by the pose of a scan: that of its match or, if lost, the predicted one."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
+        continued = prediction.T_odom_last @ self.T_previous_current
         self.lost_s = self.lost_s + prediction.interval_s if state is State.LOST else 0.0
         if self.intervals.last_scan is not None:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
@@ -257,6 +293,8 @@ class Predictor:
             self._update(prediction, match, state)
         is_known = self.scans > 0 and not scan.clock_jump_s and _shows_rotation(match, state)
         self.gyro.correct(self.T_previous_current if is_known else None)
+        if self.gyro.size == 3 and self.gyro.blocks:
+            self.accelerometer.correct(T_odom_lidar, None if state is State.LOST else match, continued[:3, 3])
         self.scans += 1
         is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)
         self.doubtful += max(1.0 - _MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)

@@ -56,6 +56,8 @@ class Recovery:
         wide = self.wide_scans > 0 or prediction.is_guess
         self.rough_cost = _ROUGH * 0.5 * kernel_scale_of(self.config, surfaces) ** 2
         best = self.matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
+        if wide and not prediction.is_possible(best.T_target_source):
+            best = self.matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior)
         tried = [best]
         unusual_cost = max(_UNUSUAL * self.usual_cost, self.rough_cost) * best.points
         is_contradicted = surfaces.dimension == 3 and best.fit < LEAST_FIT and best.cost > unusual_cost
@@ -63,8 +65,10 @@ class Recovery:
             best = self._searched(tried, points, sweep, surfaces, prediction)
         if not (is_contradicted and is_sound(best)) and self._is_uncertain(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
-                tried.append(self.matcher.align(points, surfaces, guess, wide=True))
-                best = min(best, tried[-1], key=lambda match: self._cost(match, prediction))
+                found = self.matcher.align(points, surfaces, guess, wide=True)
+                if prediction.is_possible(found.T_target_source):
+                    tried.append(found)
+                    best = min(best, found, key=lambda match: self._cost(match, prediction))
         rival = None
         if _is_free(prediction):
             best, rival = self._decided(best, tried, surfaces, prediction)
@@ -112,8 +116,11 @@ class Recovery:
             radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
             window = Window(lie.identity(2), half_width_m, half_width_rad)
             for seed in from_above(structure, surfaces, prediction.T_odom_lidar, window, radius_m):
-                if not any(_is_near(seed, match.T_target_source, surfaces.voxels.size_m) for match in tried):
-                    tried.append(self.matcher.align(points, surfaces, seed, wide=True))
+                if any(_is_near(seed, match.T_target_source, surfaces.voxels.size_m) for match in tried):
+                    continue
+                match = self.matcher.align(points, surfaces, seed, wide=True)
+                if prediction.is_possible(match.T_target_source):
+                    tried.append(match)
             found = min(tried, key=lambda match: self._cost(match, prediction))
             if found.observability >= 1.0 and found.cost < CLEARLY * best.cost:
                 best = found

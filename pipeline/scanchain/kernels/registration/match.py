@@ -96,9 +96,10 @@ def match(voxels, points, T_first, expected, settings):
         last = fit_at(problem, T, fit.iterations, fit.ending)
     if points.shape[1] == 2 and not is_fused:
         add_signals(problem, T, spectrum)
-    if is_fused:
-        remove_noise(spectrum, fit.H, fit.total_weight, settings)
-    return _result(problem, T, T_first, fit, last, spectrum, spread)
+    H = fit.H if is_fused else fit.H.copy()
+    if expected.is_measured:
+        remove_noise(spectrum, H, fit.total_weight, settings)
+    return _result(problem, T, T_first, fit, H, last, spectrum, spread)
 
 
 @njit(nogil=True)
@@ -129,11 +130,11 @@ def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
             perturb(twist, T.copy(), problem.origin, T)
             fit = fit_at(problem, T, iterations, ending)
     add_signals(problem, T, spectrum)
-    return _result(problem, T, T, fit, fit, spectrum, _spread(problem, T, fit))
+    return _result(problem, T, T, fit, fit.H, fit, spectrum, _spread(problem, T, fit))
 
 
 @njit(nogil=True)
-def _result(problem, T, T_first, fit, last, spectrum, spread):
+def _result(problem, T, T_first, fit, H, last, spectrum, spread):
     """``Result`` in the source's own frame: information from ``fit``, quality from the ``last`` correspondences.
 
     spread : (k, k) covariance of the gradient, empty to use one variance for all residuals
@@ -141,7 +142,7 @@ def _result(problem, T, T_first, fit, last, spectrum, spread):
     unweighted, b = np.empty_like(last.H), np.empty(last.H.shape[0])
     normal_equations(problem, T, WITHOUT_KERNEL_M, 0.0, unweighted, b)
     m = np.argmin(spectrum.signals)
-    H, variance = fit.H, _variance(problem, fit)
+    variance = _variance(problem, fit)
     if len(spread):
         H, variance = congruent(H, definite_inverse(spread)), 1.0
     information, direction = seen_from_source(T, T_first, H, spectrum.vectors[:, m], variance)
