@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # "as" says that the name is public here
     from scanchain.api import optimize as optimize
     from scanchain.api import run as run
     from scanchain.config import Config as Config
+    from scanchain.data import Fixes as Fixes
     from scanchain.data import Inertial as Inertial
     from scanchain.data import Match as Match
     from scanchain.data import Scan as Scan
@@ -30,6 +31,7 @@ if TYPE_CHECKING:  # "as" says that the name is public here
     from scanchain.errors import InputError as InputError
     from scanchain.errors import ScanchainError as ScanchainError
     from scanchain.evaluation.metrics import evaluate as evaluate
+    from scanchain.georeference import Georeference as Georeference
     from scanchain.graph.g2o import read_g2o as read_g2o
     from scanchain.graph.g2o import write_g2o as write_g2o
     from scanchain.graph.pose_graph import PoseGraph as PoseGraph
@@ -52,9 +54,10 @@ if TYPE_CHECKING:  # "as" says that the name is public here
 _MODULES = {
     "api": "changes cloud compare downsample judge localize merge optimize run",
     "config": "Config",
-    "data": "Inertial Match Scan State Step Trajectory",
+    "data": "Fixes Inertial Match Scan State Step Trajectory",
     "errors": "InputError ScanchainError",
     "evaluation.metrics": "evaluate",
+    "georeference": "Georeference",
     "graph.g2o": "read_g2o write_g2o",
     "graph.pose_graph": "PoseGraph",
     "logs": "open_log",

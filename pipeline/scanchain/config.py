@@ -28,7 +28,7 @@ def _one_of(choices: dict[str, str]) -> Meta:
     return Meta(pattern=rf"^({'|'.join(choices)}|{CLASS_NAME})\Z", extra={"choices": tuple(choices)})
 
 
-NO_TOPIC = "none"  # of ``log.ground_truth_topic`` and ``log.imu_topic``
+NO_TOPIC = "none"  # of ``log.ground_truth_topic``, ``log.imu_topic`` and ``log.gnss_topic``
 
 MATCHERS = {
     "plicp": "scanchain.registration.plicp:PointToShapeMatcher",
@@ -68,6 +68,8 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
     imu_topic : IMU, ``sensor_msgs/Imu``, used where it predicts motions better than the scans; found
         automatically where empty, ``none`` leaves it unused
+    gnss_topic : GNSS receiver, ``sensor_msgs/NavSatFix``, which gives the result its place on Earth, see
+        ``graph.gnss``; found automatically where empty, ``none`` leaves it unused
     upside_down : whether a planar lidar hangs upside down although no transform says so: its scans are mirrored
     start_s : everything before this time, counted from the first message, is skipped
     end_s : everything after this time, counted from the first message, is skipped
@@ -90,6 +92,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     odometry_topic: str = ""
     ground_truth_topic: str = "/ground_truth"
     imu_topic: str = ""
+    gnss_topic: str = ""
     upside_down: bool = False
     start_s: NonNegative = 0.0
     end_s: Limit = float("inf")
@@ -261,6 +264,8 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     tolerance : relative change of χ², step length, and relative gradient below which it has converged
     robust : loss of loop edges; ``truncated`` also gives each of them a verdict, by graduated non-convexity
     robust_scale : normalized error above which the loss downweights an edge, in standard deviations
+    gnss : use of the fixes of a GNSS receiver: ``constrain`` corrects drift of the trajectory that they show,
+        ``datum`` only gives the result its place on Earth
     """
 
     optimizer: Literal["levenberg-marquardt", "gauss-newton", "gradient-descent"] = "levenberg-marquardt"
@@ -268,6 +273,7 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     tolerance: Positive = 1e-6
     robust: Loss = "truncated"
     robust_scale: Positive = 3.0
+    gnss: Literal["constrain", "datum"] = "constrain"
 
 
 class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):

@@ -117,6 +117,34 @@ class Inertial(NamedTuple):
         return Inertial(stamps_ns, rates, accelerations, T)
 
 
+class Fixes(NamedTuple):
+    """Fixes of a GNSS receiver.
+
+    stamps_ns : (M,) by the clock of the scans
+    positions : (M, 3) latitude and longitude in degrees, altitude above the ellipsoid in m
+    covariances : (M, 3, 3) of east, north and up, m²
+    antenna_m : (3,) position of the antenna in the frame of the lidar; None where it is unknown
+    """
+
+    stamps_ns: Integers
+    positions: Matrix
+    covariances: Matrix
+    antenna_m: Vector | None = None
+
+    def checked(self) -> Fixes:
+        """The same, converted if nothing is lost. Raises InputError for any other shape, dtype or value."""
+        from scanchain import checks
+
+        stamps_ns = checks.whole_numbers(self.stamps_ns, "fixes.stamps_ns", "nanoseconds")
+        positions = checks.matrices(self.positions, "fixes.positions", (len(stamps_ns), 3))
+        covariances = checks.matrices(self.covariances, "fixes.covariances", (len(stamps_ns), 3, 3))
+        if len(stamps_ns) and not np.linalg.eigvalsh(covariances)[:, 0].min() > 0.0:
+            raise InputError("fixes.covariances are not positive definite")
+        antenna = self.antenna_m
+        antenna = None if antenna is None else checks.matrices(antenna, "fixes.antenna_m", (3,))
+        return Fixes(stamps_ns, positions, covariances, antenna)
+
+
 @dataclass(frozen=True, slots=True)
 class Scan:
     """One scan as the log holds it, invalid returns removed.
@@ -134,6 +162,7 @@ class Scan:
     others : points of other lidars that publish on the topic, measured just before; usually none
     origin : (d,) meters, where the lidar is in the frame of its points; None where it is the origin of that frame
     inertial : samples of an IMU; None where the log has none
+    fixes : of a GNSS receiver, since the scan before; None where there are none
 
     Arrays are converted if nothing is lost; any other shape, dtype or value raises InputError.
     """
@@ -152,6 +181,7 @@ class Scan:
     others: tuple[OtherPoints, ...] = ()
     origin: Vector | None = None
     inertial: Inertial | None = None
+    fixes: Fixes | None = None
 
     def __post_init__(self) -> None:
         """Check and convert; the class is frozen, so that the checks stay valid."""
@@ -169,6 +199,9 @@ class Scan:
             wanted = "Inertial(stamps_ns, rates, accelerations, T_lidar_imu)"
             checks.instance(self.inertial, Inertial, "inertial", wanted)
             _set(self, "inertial", self.inertial.checked())
+        if self.fixes is not None:
+            checks.instance(self.fixes, Fixes, "fixes", "Fixes(stamps_ns, positions, covariances, antenna_m)")
+            _set(self, "fixes", self.fixes.checked())
         if self.T_odom_base is not None:
             _set(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
 
@@ -182,6 +215,7 @@ class Scan:
         index: int = -1,
         T_odom_base: Pose | None = None,
         inertial: Inertial | None = None,
+        fixes: Fixes | None = None,
     ) -> Scan:
         """A scan as a driver gives it.
 
@@ -191,6 +225,7 @@ class Scan:
         index : if it is left out, odometry numbers the scan, and checks its stamp against the last ones
         T_odom_base : pose of the robot by its wheels at ``stamp_s``
         inertial : samples of an IMU since the scan before
+        fixes : of a GNSS receiver since the scan before
         """
         from scanchain import checks
 
@@ -199,7 +234,8 @@ class Scan:
         seconds = checks.point_times(times_s, "times_s", len(is_valid))
         seconds = seconds[is_valid] if len(seconds) else seconds
         dropped = len(is_valid) - len(valid)
-        return cls(index, stamp_ns, stamp_ns, valid, seconds, dropped, T_odom_base, inertial=inertial)
+        sensors = {"inertial": inertial, "fixes": fixes}
+        return cls(index, stamp_ns, stamp_ns, valid, seconds, dropped, T_odom_base, **sensors)
 
 
 class State(StrEnum):

@@ -16,6 +16,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import (
     Closure,
+    Fixes,
     GraphState,
     Keyframe,
     KeyframeErrors,
@@ -30,6 +31,7 @@ from scanchain.data import (
     brief,
 )
 from scanchain.errors import InputError, counted
+from scanchain.georeference import Georeference, Georeferencing
 from scanchain.graph.factors import Odometry
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.growing_array import GrowingArray
@@ -58,6 +60,7 @@ class SlamResult:
     ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
     suffice or there is none.
     ``map_ambiguous_share`` is the share of the searches of the map that found several similar locations.
+    ``georeference`` is the place on Earth by the fixes of a GNSS receiver; None where it is unknown.
     ``noise`` is that of the ranges, measured on the first scans; ``steps`` has the figures of all scans.
     ``components`` (K,) labels each keyframe's submap; no loop joins different submaps; usually there is one.
     """
@@ -82,6 +85,7 @@ class SlamResult:
     map_log_odds: float = math.nan
     map_rival_log_odds: float = math.nan
     map_ambiguous_share: float = 0.0
+    georeference: Georeference | None = None
     noise: RangeNoise = field(default_factory=RangeNoise)
 
     @property
@@ -129,6 +133,7 @@ class Slam:
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)  # rows of the points of each scan, if all are kept
         self.traveled_m = self.back_end.start_m
+        self.fixes: list[Fixes] = []
 
     def __repr__(self) -> str:
         scans = counted(len(self.steps), f"{self.dimension}D scan")
@@ -160,6 +165,8 @@ class Slam:
         self._check_unfinished()
         located = self.front_end.locate(scan)
         tracked = located.tracked
+        if tracked.scan.fixes is not None:
+            self.fixes.append(tracked.scan.fixes)
         started = working_s()
         is_keyframe = self._add(located)
         closures, state = self.back_end.advance(is_keyframe=is_keyframe)
@@ -197,25 +204,37 @@ class Slam:
         scan_of = np.array([keyframe.scan_index for keyframe in self.keyframes[first:]])
         starts = [start - first for start in back_end.closer.segments.starts]
         corrected = spread(state.poses[first:], scan_of, odometry.poses, starts)
+        components, graph = back_end.closer.segments.components(back_end.graph), back_end.graph
+        located = Georeferencing(self.fixes, self.T_base_lidar, self.config.graph) if self.fixes else None
+        if located is not None:
+            progress("comparing with the fixes of the GNSS receiver")
+            found = located.constrained(Trajectory(odometry.stamps_ns, corrected), graph, scan_of)
+            if found is not None:
+                graph, state = found, found.state()
+                corrected = spread(state.poses, scan_of, odometry.poses, starts)
         if self._refines:
             progress(f"refining {counted(len(odometry), 'scan')}")
             fixed, poses = self.keyframes[:first], corrected[scan_of]
             world = (fixed, state.poses[:first]) if fixed else (self.keyframes, poses)
             corrected = refined(corrected, self._points_of, *world, self.config)
         tracking, placement = self.front_end.odometry, back_end.placement
+        trajectory, notes = Trajectory(odometry.stamps_ns, corrected), tracking.predictor.notes()
+        georeference = located and located.place(trajectory)
+        if located is not None:
+            notes = (*notes, f"GNSS: {located.note}")
         return SlamResult(
-            trajectory=Trajectory(odometry.stamps_ns, corrected),
+            trajectory=trajectory,
             odometry=odometry,
             keyframes=tuple(self.keyframes),
             closures=self.closures,
-            graph=back_end.graph,
+            graph=graph,
             state=state,
-            components=back_end.closer.segments.components(back_end.graph),
+            components=components,
             map_errors=tuple(back_end.errors),
             config=self.config,
             steps=self.steps,
             warnings=tracking.predictor.warnings(),
-            sensor_notes=tracking.predictor.notes(),
+            sensor_notes=notes,
             T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,
@@ -223,6 +242,7 @@ class Slam:
             map_log_odds=placement.evidence.best if first else math.nan,
             map_rival_log_odds=placement.rival.log_odds if placement.rival.is_accepted else math.nan,
             map_ambiguous_share=back_end.closer.ambiguous_share,
+            georeference=georeference,
             noise=tracking.resolution.noise,
         )
 

@@ -50,7 +50,9 @@ def driven(log: scanchain.Log, truth: Trajectory) -> Driven:
     )
     away_m = ate_m(Trajectory(truth.stamps_ns[:count], found), Trajectory(truth.stamps_ns[:count], true))
     used = gyro.used / count
-    return Driven(away_m, step_m, np.degrees(step_rad), 1e3 * spent_s / count, used, "; ".join(odometry.predictor.warnings()))
+    return Driven(
+        away_m, step_m, np.degrees(step_rad), 1e3 * spent_s / count, used, "; ".join(odometry.predictor.warnings())
+    )
 
 
 def main() -> None:

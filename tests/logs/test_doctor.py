@@ -251,7 +251,7 @@ def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_
     assert main(["info", str(path), *flags]) == 0
     text = capfd.readouterr().out
     lines = [
-        "GNSS /fix: not used",
+        "GNSS /fix: its fixes give the place on Earth, and correct drift where they show any",
         "poses /gps: not used; --gt /gps uses them as ground truth, --log.odometry_topic /gps as wheels",
         "ground truth /ground_truth: evaluates the result, is not used for it",
         "IMU /imu/data: predicts motions where it does so better than the scans",
@@ -260,7 +260,7 @@ def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_
     assert "wheels    /odom" in text and "/odom:" not in text
     assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off", *flags]) == 0
     text = capfd.readouterr().out
-    assert "1 malformed message of /imu/data left out" in text and "note           GNSS /fix: not used\n" in text
+    assert "1 malformed message of /imu/data left out" in text and "1 malformed message of /fix left out" in text
     assert "/ground_truth: evaluates" not in text
     other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
     saved(tmp_path, [*said, *other], rename=lambda kind: names.get(kind, kind))

@@ -21,7 +21,9 @@ from tests.support.scenes import ROOT
 
 _FOLDER = ROOT / "build" / "made"
 _FILES = (".tum", ".changes.csv", ".mcap")  # of a simulated log, itself the last
-_OF_SIMULATE = ("seed", "seconds", "sensor", "changed", "reverse", "start_m", "drift", "noise_m", "dropout")
+_OF_SIMULATE = (
+    "seed", "seconds", "sensor", "changed", "reverse", "start_m", "drift", "noise_m", "dropout", "gnss",
+)  # fmt: skip
 
 
 def log(world: str, into: Path | None = None, *, folder: Path = _FOLDER, **options: object) -> Path:

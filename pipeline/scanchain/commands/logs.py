@@ -200,6 +200,7 @@ def convert(
 )
 @click.option("--sensor", metavar="NAME", help="Lidar: lms-270, utm-30, hdl-64, os1-32, vlp-16 or rosette.")
 @click.option("--imu", metavar="NAME", help="Add an IMU at 200 Hz, one of those above. [default: none]")
+@click.option("--gnss", metavar="NAME", help="Add a GNSS receiver at 10 Hz, one of those above. [default: none]")
 @click.option(
     "--drift", default=1.0, show_default=True, metavar="FACTOR", help="Scale of the errors of the wheel odometry."
 )
@@ -274,6 +275,15 @@ def simulate(world: str, destination: Path, wheels_slip: tuple[float, float, flo
     Its topic is /imu/data, its frame imu_link, turned by 90 deg about z on base_link.
 
     \b
+    GNSS receivers:
+      standard            1.7 m east and north, 3 m in height, slowly changing
+      standard-multipath  the same, and wrong by 5 to 20 m half of the time
+      standard-outages    no fix from 10 to 25 s, and from 40 to 60 s
+      rtk                 9 mm east and north, 15 mm in height
+      rtk-multipath       the same, and wrong by 5 to 20 m half of the time
+    Its topic is /fix, its frame gnss_link.
+
+    \b
     Examples:
       scanchain simulate office office.mcap
       scanchain simulate town town.mcap --duration 20 --seed 3
@@ -283,6 +293,7 @@ def simulate(world: str, destination: Path, wheels_slip: tuple[float, float, flo
       scanchain simulate town again.mcap --changed 1 --reverse --start-at 100
       scanchain simulate office slips.mcap --wheels-slip 20 24 3
       scanchain simulate turns imu.mcap --imu mems --pace 1.67
+      scanchain simulate town gnss.mcap --gnss standard-multipath
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")

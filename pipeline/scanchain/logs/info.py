@@ -47,7 +47,11 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
         "odometry": log.odometry_topic if log else wheels,
         "wheels": log.wheels if log else wheels,
         "sensors": other_sensors(
-            indexes, wheels=wheels, truth=truth, imu=log.imu.topic if log and log.imu else ""
+            indexes,
+            wheels=wheels,
+            truth=truth,
+            imu=log.imu.topic if log and log.imu else "",
+            gnss=log.gnss.topic if log and log.gnss else "",
         ),
         "point_times": log.assumed_point_times() if log else "",
         "T_base_lidar": log.T_base_lidar.tolist() if log else [],

@@ -29,8 +29,8 @@ from scanchain.logs.messages.readers import Read, is_scan, pose_reader
 from scanchain.logs.mounting import (
     Wheels,
     between_frames,
-    find_imu,
     find_mounting,
+    find_sensors,
     find_wheels,
     in_plane,
     is_upside_down,
@@ -91,7 +91,7 @@ class Log:
     distortion : motion distortion of scans without point times, as text; empty if it is removed
     distorted_share : share of the motion between scans that distorts them, if it is not removed
 
-    imu : its IMU; None if it has none, or several
+    imu, gnss : its IMU and its GNSS receiver; None if it has none, or several
 
     Set by reading, once ``scans`` is exhausted or closed:
     bad_scans, scans_with_wheels : number of scans left out, and with a wheel reading near their stamp
@@ -147,7 +147,7 @@ class Log:
         self.T_base_lidar: Pose = in_plane(T) if is_planar else T
         self.stated_mounting = self.T_base_lidar if mounting.is_stated else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]
-        self.imu = find_imu(indexes, config.imu_topic, self.publishers.frame, self.span, self.notes)
+        self.imu, self.gnss = find_sensors(indexes, config, self.publishers.frame, self.span, self.notes)
         self.sample_decoders = self._sample_decoders(wheels, truth)
         self.scans_with_wheels, self.bad_scans, self.distorted_share, self.distortion = 0, 0, 0.0, ""
         self.jumps, self._truth, self._opening_notes = list[str](), None, tuple(self.notes)
@@ -195,7 +195,9 @@ class Log:
         """
         self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
-        recorded = Recorded(self.odometry_topic, self.ground_truth_topic, self.imu, is_mirrored=self.is_mirrored)
+        recorded = Recorded(
+            self.odometry_topic, self.ground_truth_topic, self.imu, self.gnss, is_mirrored=self.is_mirrored
+        )
         counts = ScanCounts(self.topic, self.odometry_topic)
         self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
         self.together = Together(self.topic, self.others, self.publishers, is_mirrored=self.is_mirrored)
@@ -227,6 +229,7 @@ class Log:
                     others=others,
                     origin=own.origin if own.origin.any() else None,
                     inertial=recorded.inertial(returns),
+                    fixes=recorded.fixes(),
                 )
                 counts.add(scan)
                 self.scans_with_wheels += T_odom_base is not None
@@ -316,7 +319,7 @@ class Log:
 
     def _sample_decoders(self, wheels: Wheels | None, truth: Channel | None) -> dict[str, Read]:
         """Readers of the messages of the other sensors, by topic."""
-        found: dict[str, Read] = {} if self.imu is None else {self.imu.topic: self.imu.read}
+        found: dict[str, Read] = {each.topic: each.read for each in (self.imu, self.gnss) if each is not None}
         if wheels is not None:
             found[wheels.channel.topic] = pose_reader(wheels.channel, self.dimension, wheels.link)
         if truth is not None:

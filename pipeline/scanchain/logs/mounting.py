@@ -10,12 +10,13 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import NO_TOPIC, LogConfig
-from scanchain.data import Pose
+from scanchain.data import Pose, Vector
 from scanchain.errors import InputError
 from scanchain.logs.index import Channel, FileIndex, name_of
+from scanchain.logs.messages.gnss import Fix
 from scanchain.logs.messages.inertial import ImuSample
 from scanchain.logs.messages.poses import Frames, StampedPose, chain
-from scanchain.logs.messages.readers import Read, is_moving_transforms, pose_reader, reader, role
+from scanchain.logs.messages.readers import Read, Role, is_moving_transforms, pose_reader, reader, role
 from scanchain.logs.stream import Span, sampled_messages
 from scanchain.logs.topics import find_odometry, topics_of
 
@@ -125,30 +126,58 @@ class Imu(NamedTuple):
     T_lidar_imu: Pose | None
 
 
-def find_imu(indexes: Sequence[FileIndex], wanted: str, frame: str, span: Span, notes: list[str]) -> Imu | None:
-    """The IMU of the configured topic, else the only one; None for ``NO_TOPIC``, or if there are several.
+class Gnss(NamedTuple):
+    """A GNSS receiver: topic, reader of its messages, and position (3,) of the antenna in the frame of the lidar.
 
-    frame : of the lidar
-    Raises InputError if the configured topic is not one of an IMU.
+    The position is None where the log does not state it.
     """
-    found = {each.topic: each for each in topics_of(indexes).values() if role(each) == "imu"}
+
+    topic: str
+    read: Read
+    antenna_m: Vector | None
+
+
+def find_sensors(
+    indexes: Sequence[FileIndex], config: LogConfig, frame: str, span: Span, notes: list[str]
+) -> tuple[Imu | None, Gnss | None]:
+    """IMU and GNSS receiver of the configured topics, else the only ones.
+
+    Each is None for ``NO_TOPIC``, and if there are several.
+    frame : of the lidar
+    Raises InputError if a configured topic is not one of that sensor.
+    """
+    imu = _only(indexes, "imu", config.imu_topic, notes)
+    gnss = _only(indexes, "gnss", config.gnss_topic, notes)
+    T_imu, T_gnss = (each and _on_lidar(indexes, each, frame, span) for each in (imu, gnss))
+    antenna_m = None if T_gnss is None else T_gnss[:3, 3]
+    return imu and Imu(imu.topic, reader(imu), T_imu), gnss and Gnss(gnss.topic, reader(gnss), antenna_m)
+
+
+_SENSORS = {"imu": ("IMU", "sensor_msgs/Imu"), "gnss": ("GNSS receiver", "sensor_msgs/NavSatFix")}  # name and type
+
+
+def _only(indexes: Sequence[FileIndex], sensor: Role, wanted: str, notes: list[str]) -> Channel | None:
+    """The configured channel of a sensor, else the only one."""
+    found = {each.topic: each for each in topics_of(indexes).values() if role(each) == sensor}
     if wanted in found:
-        return _imu_of(indexes, found[wanted], frame, span)
-    names = ", ".join(found)
+        return found[wanted]
+    (name, type_name), names, key = _SENSORS[sensor], ", ".join(found), f"log.{sensor}_topic"
     if wanted not in ("", NO_TOPIC):
         known = f"these are: {names or 'none'}"
-        raise InputError(f"{name_of(indexes)}: log.imu_topic {wanted} is not a topic of sensor_msgs/Imu; {known}")
+        raise InputError(f"{name_of(indexes)}: {key} {wanted} is not a topic of {type_name}; {known}")
     if len(found) > 1 and not wanted:
-        notes.append(f"several IMUs ({names}), none is used; choose with --log.imu_topic")
-    return _imu_of(indexes, next(iter(found.values())), frame, span) if len(found) == 1 and not wanted else None
+        notes.append(f"several {name}s ({names}), none is used; choose with --{key}")
+    return next(iter(found.values())) if len(found) == 1 and not wanted else None
 
 
-def _imu_of(indexes: Sequence[FileIndex], channel: Channel, frame: str, span: Span) -> Imu:
-    read = reader(channel)
-    first = next(sampled_messages(indexes, channel.topic, read), None)
-    own = first.value.frame if first is not None and isinstance(first.value, ImuSample) else ""
-    T = np.eye(4) if own and own == frame else between_frames(indexes, span, frame, own) if own and frame else None
-    return Imu(channel.topic, read, T)
+def _on_lidar(indexes: Sequence[FileIndex], channel: Channel, frame: str, span: Span) -> Pose | None:
+    """T_lidar_sensor (4, 4) by the frame of the first sample; None where the log does not state it."""
+    sampled = (each.value for each in sampled_messages(indexes, channel.topic, reader(channel)))
+    samples = (sample for value in sampled for sample in (value if isinstance(value, list) else [value]))
+    own = next((each.frame for each in samples if isinstance(each, ImuSample | Fix)), "")
+    if not own or not frame:
+        return None
+    return np.eye(4) if own == frame else between_frames(indexes, span, frame, own)
 
 
 class MovingFrame(NamedTuple):

@@ -8,14 +8,15 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from scanchain.data import Inertial, Pose, Trajectory
+from scanchain.data import Fixes, Inertial, Pose, Trajectory
 from scanchain.errors import counted
 from scanchain.logs.index import Decoded
+from scanchain.logs.messages.gnss import Fix
 from scanchain.logs.messages.inertial import ImuSample
 from scanchain.logs.messages.point_times import Returns
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.ros import MalformedMessageError
-from scanchain.logs.mounting import Imu
+from scanchain.logs.mounting import Gnss, Imu
 
 _RETAINED = 4096  # samples in memory: of 2 s and more at 2000 Hz
 NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and that a scan waits for it
@@ -89,13 +90,18 @@ class Recorded:
     """
 
     def __init__(
-        self, odometry_topic: str, ground_truth_topic: str, imu: Imu | None = None, *, is_mirrored: bool = False
-    ) -> None:
+        self, odometry_topic: str, ground_truth_topic: str, imu: Imu | None = None, gnss: Gnss | None = None, *,
+        is_mirrored: bool = False,
+    ) -> None:  # fmt: skip
         """is_mirrored : whether a planar lidar hangs upside down; its frame is then as seen from above."""
         self.odometry, self.imu = SampleStream[StampedPose](), SampleStream[ImuSample]()
         self.T_lidar_imu = None if imu is None else imu.T_lidar_imu
         if self.T_lidar_imu is not None and is_mirrored:
             self.T_lidar_imu = np.diag([1.0, -1.0, -1.0, 1.0]) @ self.T_lidar_imu
+        self._fixes = list[Fix]()  # those since the last scan
+        self.antenna_m = None if gnss is None else gnss.antenna_m
+        if self.antenna_m is not None and is_mirrored:
+            self.antenna_m = self.antenna_m * (1.0, -1.0, -1.0)
         self._given_ns = 0  # stamp of the last sample that a scan has
         named = {odometry_topic: self.odometry, "" if imu is None else imu.topic: self.imu}
         self.streams: dict[str, SampleStream[Any]] = {topic: stream for topic, stream in named.items() if topic}
@@ -115,6 +121,8 @@ class Recorded:
                 self.truth.append(sample)
             if topic in self.streams:
                 self.streams[topic].add(sample)
+            if isinstance(sample, Fix):
+                self._fixes.append(sample)
 
     def covers(self, returns: Returns) -> bool:
         """True if every stream has a sample at or after the stamp of a scan, that of the IMU after its end."""
@@ -135,6 +143,14 @@ class Recorded:
         stamps_ns = np.array([each.stamp_ns for each in found], np.int64)
         rates, accelerations = np.array([(each.rates, each.accelerations) for each in found]).swapaxes(0, 1)
         return Inertial(stamps_ns, rates, accelerations, self.T_lidar_imu)
+
+    def fixes(self) -> Fixes | None:
+        """The fixes of the GNSS receiver since the scan before; None without any."""
+        found, self._fixes = self._fixes, []
+        if not found:
+            return None
+        stamps_ns, _, positions, covariances = zip(*found, strict=True)
+        return Fixes(np.array(stamps_ns, np.int64), np.array(positions), np.array(covariances), self.antenna_m)
 
     def ground_truth(self, lidar_on: Callable[[str], Pose]) -> Trajectory | None:
         """True poses of the lidar so far; None if there are none.

@@ -93,21 +93,21 @@ class OtherSensor:
     use: str
 
 
-def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str, imu: str) -> list[OtherSensor]:
-    """Ground truth, IMU, GNSS and other poses of a log; ``wheels``, ``truth`` and ``imu`` are their topics."""
+def other_sensors(
+    indexes: Sequence[FileIndex], *, wheels: str, truth: str, imu: str, gnss: str
+) -> list[OtherSensor]:
+    """Ground truth, IMU, GNSS and other poses of a log; the arguments are the topics that are used."""
     found = []
     for topic, channel in topics_of(indexes).items():
         if topic == truth:
             found.append(OtherSensor("ground truth", topic, "evaluates the result, is not used for it"))
         elif role(channel) == "imu":
-            use = (
-                "predicts motions where it does so better than the scans"
-                if topic == imu
-                else "not used"
-            )
+            use = "predicts motions where it does so better than the scans" if topic == imu else "not used"
             found.append(OtherSensor("IMU", topic, use))
         elif kind(channel) in _GNSS:
-            found.append(OtherSensor("GNSS", topic, "not used"))
+            use = "not used" if role(channel) == "gnss" else "not used: only sensor_msgs/NavSatFix is read"
+            used = "its fixes give the place on Earth, and correct drift where they show any"
+            found.append(OtherSensor("GNSS", topic, used if topic == gnss else use))
         elif has_poses(channel) and topic != wheels:
             use = f"--gt {topic} uses them as ground truth, --log.odometry_topic {topic} as wheels"
             found.append(OtherSensor("poses", topic, f"not used; {use}"))

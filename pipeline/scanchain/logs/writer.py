@@ -85,6 +85,14 @@ def pack_imu(stamp_ns: int, frame: str, rate_rad_s: Sequence[float], acceleratio
     return packed("sensor_msgs/msg/Imu", header(stamp_ns, frame), *parts)
 
 
+def pack_fix(stamp_ns: int, frame: str, position: Sequence[float], sigma_m: Sequence[float] | None) -> bytes:
+    """A sensor_msgs/NavSatFix: latitude, longitude, altitude, σ east, north and up; None for no fix."""
+    status = new("sensor_msgs/msg/NavSatStatus", -1 if sigma_m is None else 0, 1)
+    covariance = np.diag(np.square(sigma_m or (0.0, 0.0, 0.0))).ravel()
+    kind = 0 if sigma_m is None else 2  # unknown, or the diagonal is known
+    return packed("sensor_msgs/msg/NavSatFix", header(stamp_ns, frame), status, *position, covariance, kind)
+
+
 class Link(NamedTuple):
     """Pose of the frame ``child`` in ``parent``."""
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from enum import IntEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from scanchain.data import Points
 from scanchain.errors import InputError, one_line
 from scanchain.maps.occupancy_grid import FREE_PROBABILITY, OCCUPIED_PROBABILITY, OccupancyGrid
 from scanchain.processes import KilledFor, die_first, die_with_parent, reading_limits, run_within
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _PLY_COMMENT = "scanchain, meters, world frame"
@@ -94,8 +98,8 @@ def write_pcd(path: Path | str, points: Points) -> None:
     Path(path).write_bytes(_PCD.format(count=len(points)).encode("ascii") + _in_space(points).tobytes())
 
 
-def write_laz(path: Path | str, points: Points) -> None:
-    """Write points (N, d) as LAZ 1.4, to the millimeter."""
+def write_laz(path: Path | str, points: Points, crs: CRS | None = None) -> None:
+    """Write points (N, d) as LAZ 1.4, to the millimeter, in a coordinate reference system."""
     import laspy
 
     rows = lie.lift_points(points)
@@ -103,6 +107,8 @@ def write_laz(path: Path | str, points: Points) -> None:
     header.generating_software = "scanchain"
     header.scales = np.full(3, STEP_M)
     header.offsets = np.floor(rows.min(axis=0)) if len(rows) else np.zeros(3)
+    if crs is not None:
+        header.add_crs(crs)
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = rows.T
     cloud.write(str(path))

@@ -30,7 +30,8 @@ _P, _V, _G, _B = (slice(at, at + 3) for at in (0, 3, 6, 9))  # position, velocit
 
 def _block(*at: tuple[int, int]) -> Matrix:
     """(12, 12), the identity in some of its 4 x 4 blocks (position, velocity, gravity, bias), else zero."""
-    return np.kron(np.array([[(i, j) in at for j in range(4)] for i in range(4)], np.float64), np.eye(3))
+    blocks = np.array([[(i, j) in at for j in range(4)] for i in range(4)])
+    return np.kron(blocks, np.eye(3)).astype(np.float64)
 
 
 _ONCE, _TWICE = _block((0, 1), (1, 2)), _block((0, 2))  # of the motion over a time: position, velocity, gravity
@@ -106,7 +107,7 @@ class Accelerometer:
             information = _CONTRADICTED * information
         C = np.linalg.inv(information + _LEAST * np.eye(6))[:3, :3] + _POSITION_M**2 * np.eye(3)
         C = R @ C @ R.T
-        self._compare(T_odom_lidar[:3, 3], continued, np.linalg.inv(C))
+        self._compare(T_odom_lidar[:3, 3], continued, np.linalg.inv(C).astype(np.float64))
         innovation = T_odom_lidar[:3, 3] + R @ self.p_lidar_imu - self.x[_P]
         C *= self.of_match
         weighted = np.linalg.solve(self.P[_P, _P] + C, innovation)

@@ -18,6 +18,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.errors import InputError
 from scanchain.files import Source, write_whole
+from scanchain.georeference import Origin
 from scanchain.runs.provenance import Hashing, describe_start, log_file
 from scanchain.settings import dump
 
@@ -95,13 +96,16 @@ class RunDirectory:
         if config is not None:
             write_whole(self.path / CONFIG_FILE, dump(config).encode())
 
-    def end(self, *, duration_s: float | None = None, stopped: str = "", is_complete: bool = True) -> None:
+    def end(
+        self, *, duration_s: float | None = None, stopped: str = "", is_complete: bool = True,
+        origin: Origin | None = None,
+    ) -> None:  # fmt: skip
         """Write the final run.json; of a complete result, with the hashes of its sources."""
         if is_complete:
             self.provenance = self.provenance.hashed(self.hashing.digests())
         duration_s = working_s() - self.began_s if duration_s is None else duration_s
         self.provenance = msgspec.structs.replace(
-            self.provenance, complete=is_complete, stopped=stopped, duration_s=duration_s
+            self.provenance, complete=is_complete, stopped=stopped, duration_s=duration_s, origin=origin
         )
         self.provenance.write(self.path / RUN_FILE)
 

@@ -16,6 +16,7 @@ from msgspec import Struct, structs
 
 from scanchain.errors import InputError
 from scanchain.files import Source, without_keys, write_whole
+from scanchain.georeference import Origin
 from scanchain.logs.files import RemoteFile, files_of, size_of
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
@@ -35,7 +36,10 @@ class LogFile(Struct, frozen=True):
 
 
 class Provenance(Struct, frozen=True):
-    """Origin of a run directory. ``complete`` is False while it is written and if it is marked partial."""
+    """Origin of a run directory. ``complete`` is False while it is written and if it is marked partial.
+
+    ``origin`` is that of the world frame on Earth, null where it is unknown.
+    """
 
     complete: bool
     stopped: str
@@ -48,6 +52,7 @@ class Provenance(Struct, frozen=True):
     platform: str
     cores: int
     versions: dict[str, str]
+    origin: Origin | None = None
 
     def write(self, path: Path) -> None:
         """Write as JSON, atomically."""

@@ -46,6 +46,7 @@ from scanchain.runs.evidence import evidence_of
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import steps_table, write_table
+from scanchain.runs.track import write_track
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum
 from scanchain.verdict import Judged, judge
@@ -205,6 +206,9 @@ def write_results(folder: Path, results: Results) -> None:
     if log.mounting.base and log.mounting.motion is None:  # robot base, in the same world frame
         poses = trajectory.poses @ lie.inverse(log.T_base_lidar)
         write_tum(folder / "trajectory_base.tum", Trajectory(trajectory.stamps_ns, poses))
+    if (place := result.georeference) is not None:
+        write_tum(folder / "trajectory_enu.tum", place.enu(trajectory))
+        write_track(folder, Path(str(log.paths[0])).stem, place.enu(trajectory), place)
     write_g2o(folder / GRAPH_FILE, graph)
     if graph.is_rejected.any():
         write_g2o(rejected_path(folder / GRAPH_FILE), graph, edges="rejected")
@@ -218,7 +222,8 @@ def write_results(folder: Path, results: Results) -> None:
     if config.maps.write_pcd:
         write_pcd(folder / "map.pcd", points)
     if config.maps.write_laz:
-        write_laz(folder / "map.laz", points)
+        projected, crs = (points, None) if place is None else place.projected(points)
+        write_laz(folder / "map.laz", projected, crs)
     if config.outputs.mcap:  # after the maps, which it reads
         write_results_mcap(folder / "results.mcap", log, result, results.T_world_level)
 

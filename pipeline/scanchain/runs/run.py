@@ -13,6 +13,7 @@ from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.data import Scan, brief
 from scanchain.errors import InputError, OwnCodeError, ScanchainError, counted
 from scanchain.evaluation import ExpectedErrors, on_the_estimate
+from scanchain.georeference import Georeference
 from scanchain.logs.topics import other_sensors
 from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
@@ -82,7 +83,7 @@ def run(
             run_s = working_s() - directory.began_s + (left.run_s if left else 0.0) - held_s
             times_s = run_s, compiled_s() - compiled_before_s
             metrics, text = this.measure(results, expected, judged, recording.warnings, times_s)
-            return this.complete(metrics, text, report)
+            return this.complete(metrics, text, result.georeference, report)
         except (Exception, KeyboardInterrupt) as error:
             is_early = not len(this.steps) and isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
             if is_early or isinstance(error, OwnCodeError):
@@ -197,6 +198,7 @@ class _Run:
             "wheels": log.odometry_topic,
             "truth": log.ground_truth_topic,
             "imu": log.imu.topic if log.imu else "",
+            "gnss": log.gnss.topic if log.gnss else "",
         }
         sensors = other_sensors(log.indexes, **used)
         idle = [f"{each.sensor} {each.topic}: {each.use}" for each in sensors if each.use.startswith("not used")]
@@ -211,12 +213,15 @@ class _Run:
             write_figures(folder, metrics, text)
         return metrics, text
 
-    def complete(self, metrics: Metrics, text: str, report: Callable[[Path], None]) -> Finished:
+    def complete(
+        self, metrics: Metrics, text: str, place: Georeference | None, report: Callable[[Path], None]
+    ) -> Finished:
         """Add the report and give a complete run its name; a stopped one stays marked partial."""
         directory, stopped, warnings = self.directory, metrics.stopped, metrics.warnings
         if stopped:
             directory.worth_keeping()
-        directory.end(duration_s=metrics.run_s + metrics.compile_s, stopped=stopped, is_complete=not stopped)
+        took_s, origin = metrics.run_s + metrics.compile_s, place and place.origin
+        directory.end(duration_s=took_s, stopped=stopped, is_complete=not stopped, origin=origin)
         self.progress.say("drawing the report")
         try:
             report(directory.path)

@@ -16,16 +16,20 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
+from scanchain.geodesy import Geodesy
 from scanchain.logs.writer import (
     Link,
     LogWriter,
+    pack_fix,
     pack_imu,
     pack_laser_scan,
     pack_odometry,
     pack_transforms,
     place,
+    place_of,
 )
 from scanchain.simulation.another_day import Change, another_day, write_changes
+from scanchain.simulation.gnss import ORIGIN, RECEIVERS, GnssModel, GnssSamples
 from scanchain.simulation.imu import IMUS, ImuModel
 from scanchain.simulation.motion import Motion, begun_at, laps, pivots, wheel_odometry
 from scanchain.simulation.sensors import SENSORS, Sensor, Sweep, take_sweep
@@ -34,7 +38,7 @@ from scanchain.simulation.worlds import WORLDS, World
 from scanchain.trajectory import write_tum
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan, in November 2023
-_PLACE, _DEVIATION, _WHEELS, _RANGES, _IMU = range(5)  # each purpose has random numbers of its own
+_PLACE, _DEVIATION, _WHEELS, _RANGES, _IMU, _GNSS = range(6)  # each purpose has random numbers of its own
 _ODOMETRY_PERIOD_NS = 20_000_000  # 50 Hz, as of most robots' drivers
 _DROPOUT_S = 1.0  # seconds without scans at each of the dropouts of a world
 _PATH_STEP_S = 0.1  # between the positions of a drive that objects keep clear of
@@ -64,7 +68,7 @@ class Drive:
     drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
     solids_of_instant : the solids at the start of a scan, if some of them move
     changes : of the world since the drive of the same seed on the first day
-    imu : None if the vehicle has none
+    imu, gnss : None if the vehicle has none
     """
 
     solids: Solids
@@ -79,6 +83,7 @@ class Drive:
     solids_of_instant: Callable[[float], Solids] | None = None
     changes: tuple[Change, ...] = ()
     imu: ImuModel | None = None
+    gnss: GnssModel | None = None
 
     def truth(self) -> Trajectory:
         """T_world_lidar at the stamp of every recorded scan: SE(2) for a laser scanner, SE(3) for a lidar."""
@@ -102,12 +107,15 @@ def plan(
     start_m: float = 0.0,
     pace: float = 1.0,
     imu: str | None = None,
+    gnss: str | None = None,
 ) -> Drive:
     """The drive that ``simulate`` records for the same arguments."""
     if world not in WORLDS:
         raise InputError(f"world {world!r} does not exist; choose one of {', '.join(WORLDS)}")
     if imu is not None and imu not in IMUS:
         raise InputError(f"IMU {imu!r} does not exist; choose one of {', '.join(IMUS)}")
+    if gnss is not None and gnss not in RECEIVERS:
+        raise InputError(f"GNSS receiver {gnss!r} does not exist; choose one of {', '.join(RECEIVERS)}")
     scene = WORLDS[world]
     lidar = _sensor(sensor or scene.sensor, noise_m, dropout, scene.sight_m)
     length_s = scene.duration_s if duration_s is None else duration_s
@@ -142,7 +150,7 @@ def plan(
     scans = _recorded(scene, motion, lidar, count)
     return Drive(
         solids, motion, lidar, scene.vehicle.T_base_lidar, scans, seed, changed, drift, wheels_slip,
-        changes=changes, imu=None if imu is None else IMUS[imu],
+        changes=changes, imu=None if imu is None else IMUS[imu], gnss=None if gnss is None else RECEIVERS[gnss],
     )  # fmt: skip
 
 
@@ -204,16 +212,17 @@ def simulate(
     A scan's stamp is the instant of its first ray, point times are relative to it, and it is logged at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, only /odom continues.
-    With an IMU it also holds /imu/data (200 Hz, frame imu_link) and T_base_imu in /tf_static.
+    With an IMU it also holds /imu/data (200 Hz, frame imu_link) and T_base_imu in /tf_static, with a GNSS receiver
+    /fix (10 Hz, frame gnss_link) and the position of its antenna.
 
     force : whether existing files are replaced
     progress : called with the number of scans done and the total
     options : ``seed``, 0 by default; ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in
         place of the sensor's own; ``drift``, which multiplies the errors of the wheel odometry, and
-        ``wheels_slip``, by which it slips once; ``imu``, by name; ``pace``, a factor on the speed of the drive;
-        ``reverse`` to drive in the opposite direction, from ``start_m`` along that route; ``changed``, a seed, for
-        another day: furniture or parked cars appeared, vanished or moved, as listed in .changes.csv next to the
-        log, and the drive is repeated with other deviations and noise
+        ``wheels_slip``, by which it slips once; ``imu`` and ``gnss``, by name; ``pace``, a factor on the
+        speed of the drive; ``reverse`` to drive in the opposite direction, from ``start_m`` along that route;
+        ``changed``, a seed, for another day: furniture or parked cars appeared, vanished or moved, as listed in
+        .changes.csv next to the log, and the drive is repeated with other deviations and noise
 
     Returns the ground truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
@@ -239,6 +248,9 @@ def record(
         links = [Link("base_link", "lidar", place(drive.T_base_lidar))]
         if drive.imu is not None and drive.imu.is_transform_known:
             links.append(Link("base_link", "imu_link", place(drive.imu.T_base_imu)))
+        if drive.gnss is not None:
+            antenna = place_of(drive.gnss.antenna_m.tolist(), (0.0, 0.0, 0.0, 1.0))
+            links.append(Link("base_link", "gnss_link", antenna))
         log.append("/tf_static", "tf2_msgs/msg/TFMessage", pack_transforms(EPOCH_NS, *links), EPOCH_NS)
         others = _OtherSensors(log, drive, int(truth.stamps_ns[-1]) + period_ns)
         for done, sweep in enumerate(_sweeps(drive)):
@@ -282,13 +294,15 @@ class _Message(NamedTuple):
 
 
 class _OtherSensors:
-    """Messages of the wheels and the IMU until the stamp ``last_ns``, written in the order of their stamps."""
+    """Messages of the wheels, the IMU and the GNSS receiver until ``last_ns``, in the order of their stamps."""
 
     def __init__(self, log: LogWriter, drive: Drive, last_ns: int) -> None:
         self._log = log
         sources = [_wheels(drive, last_ns)]
         if drive.imu is not None:
             sources.append(_imu(drive, drive.imu, last_ns))
+        if drive.gnss is not None:
+            sources.append(_gnss(drive, drive.gnss, last_ns))
         self._messages = merge(*sources, key=lambda message: message.stamp_ns)
         self._next = next(self._messages, None)
 
@@ -318,6 +332,21 @@ def _imu(drive: Drive, imu: ImuModel, last_ns: int) -> Iterator[_Message]:
     samples = imu.measure(drive.motion, instants_s, _random(drive.seed, _IMU, drive.changed))
     for stamp_ns, *vectors in zip(stamps_ns.tolist(), *(values.tolist() for values in samples), strict=True):
         yield _Message(stamp_ns, "/imu/data", "sensor_msgs/msg/Imu", pack_imu(stamp_ns, "imu_link", *vectors))
+
+
+def fixes_of(drive: Drive, gnss: GnssModel, last_ns: int) -> tuple[NDArray[np.int64], GnssSamples]:
+    """Stamps (N,) and samples of a receiver until a stamp."""
+    stamps_ns = np.arange(EPOCH_NS, last_ns + 1, gnss.period_ns)
+    instants_s = (stamps_ns - EPOCH_NS) * 1e-9
+    return stamps_ns, gnss.measure(drive.motion, instants_s, _random(drive.seed, _GNSS, drive.changed))
+
+
+def _gnss(drive: Drive, gnss: GnssModel, last_ns: int) -> Iterator[_Message]:
+    stamps_ns, samples = fixes_of(drive, gnss, last_ns)
+    positions = Geodesy(*ORIGIN).geodetic(samples.enu_m)
+    for stamp_ns, position, is_out in zip(stamps_ns.tolist(), positions.tolist(), samples.is_out, strict=True):
+        data = pack_fix(stamp_ns, "gnss_link", position, None if is_out else gnss.sigma_m)
+        yield _Message(stamp_ns, "/fix", "sensor_msgs/msg/NavSatFix", data)
 
 
 def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) -> None:

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_type_hints
 
 from scanchain.logs.index import Channel
 from scanchain.logs.messages import foxglove
+from scanchain.logs.messages.gnss import read_fix
 from scanchain.logs.messages.inertial import read_imu
 from scanchain.logs.messages.lidar import Sensed, read_livox, read_multi_echo_scan
 from scanchain.logs.messages.poses import Frames, read_pose, read_transforms
@@ -17,7 +18,7 @@ Read = Callable[..., Any]
 _ROS, _FOXGLOVE = ("cdr", "ros1"), ("json", "protobuf")  # encodings
 
 
-Role = Literal["scan", "cloud", "odometry", "pose", "transforms", "imu"]  # use of a message type
+Role = Literal["scan", "cloud", "odometry", "pose", "transforms", "imu", "gnss"]  # use of a message type
 _TYPES: dict[str, tuple[Role, Read]] = {  # ROS 1 and 2 have the same fields
     "sensor_msgs/LaserScan": ("scan", Sensed),
     "sensor_msgs/MultiEchoLaserScan": ("scan", read_multi_echo_scan),
@@ -32,6 +33,7 @@ _TYPES: dict[str, tuple[Role, Read]] = {  # ROS 1 and 2 have the same fields
     "geometry_msgs/PoseWithCovarianceStamped": ("pose", read_pose),
     "foxglove.PoseInFrame": ("pose", foxglove.pose_in_frame),
     "sensor_msgs/Imu": ("imu", read_imu),
+    "sensor_msgs/NavSatFix": ("gnss", read_fix),
     "tf2_msgs/TFMessage": ("transforms", read_transforms),
     "tf/tfMessage": ("transforms", read_transforms),
     "foxglove.FrameTransform": ("transforms", foxglove.frame_transform),

@@ -1,0 +1,174 @@
+"""The GNSS receiver of a log: its topic, its antenna, the fixes of a scan, and the files of a run."""
+
+import json
+from xml.etree import ElementTree
+
+import laspy
+import numpy as np
+import pytest
+
+import scanchain
+from scanchain import lie
+from scanchain.errors import InputError
+from scanchain.geodesy import Geodesy
+from scanchain.logs.info import describe
+from scanchain.logs.writer import LogWriter, pack_fix
+from scanchain.settings import load_settings
+from scanchain.simulation import plan
+from scanchain.simulation.gnss import ORIGIN, RECEIVERS, T_ENU_WORLD
+from tests.support import made
+
+MIDDLE = (49.0, 8.4, 100.0)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return made.log("office", seconds=20.0, gnss="rtk")
+
+
+@pytest.fixture(scope="module")
+def run():
+    return made.run("office", seconds=20.0, gnss="rtk", maps__write_laz=True, outputs__error_bars="quick")
+
+
+def with_fixes(log, folder, *said, topic="/b"):
+    """Log files: the given one, and one with further fixes of these positions and standard deviations."""
+    begin_ns = int(scanchain.open_log(log).expected_stamps("/scan")[0])
+    with LogWriter(folder / "more.mcap") as writer:
+        for k, (position, sigma_m) in enumerate(said):
+            stamp_ns = begin_ns + k * 100_000_000
+            writer.append(topic, "sensor_msgs/msg/NavSatFix", pack_fix(stamp_ns, "a", position, sigma_m), stamp_ns)
+    return [log, folder / "more.mcap"]
+
+
+def fixes_of(opened):
+    return [scan.fixes for scan in opened if scan.fixes is not None]
+
+
+def test_the_only_receiver_is_found_with_its_antenna_and_scans_have_each_fix_once(log):
+    opened = scanchain.open_log(log)
+    assert opened.gnss.topic == "/fix"
+    in_base = lie.transform(opened.mounting.T_base_lidar, opened.gnss.antenna_m[None])[0]
+    np.testing.assert_allclose(in_base, RECEIVERS["rtk"].antenna_m, atol=1e-9)
+    stamps_ns = np.concatenate([each.stamps_ns for each in fixes_of(opened)])
+    assert len(stamps_ns) > 190 and (np.diff(stamps_ns) == 100_000_000).all()
+    np.testing.assert_allclose(fixes_of(opened)[0].covariances[0], np.diag(np.square(RECEIVERS["rtk"].sigma_m)))
+
+
+def test_fixes_are_true_positions_of_the_antenna_within_what_the_receiver_states(log):
+    drive = plan("office", duration_s=20.0)
+    fixes = fixes_of(scanchain.open_log(log))
+    enu_m = Geodesy(*ORIGIN).enu(np.concatenate([each.positions for each in fixes]))
+    T = T_ENU_WORLD @ drive.motion.base(0.1 * np.arange(len(enu_m)))
+    errors = enu_m - T[:, :3, 3] - T[:, :3, :3] @ RECEIVERS["rtk"].antenna_m
+    assert 0.3 < (errors / RECEIVERS["rtk"].sigma_m).std() < 1.7
+
+
+def test_half_of_the_fixes_are_wrong_by_5_to_20_m_under_multipath():
+    drive = plan("rounds", gnss="standard-multipath")
+    samples = [
+        drive.gnss.measure(drive.motion, np.arange(0.0, 160.0, 0.1), np.random.default_rng(seed))
+        for seed in range(5)
+    ]
+    share = np.mean([each.is_multipath.mean() for each in samples])
+    true = drive.gnss.measure(drive.motion, np.arange(0.0, 160.0, 0.1), np.random.default_rng(0))
+    assert 0.4 < share < 0.6 and true.is_multipath[:30].sum() == 0
+
+
+def test_without_a_fix_there_is_none_and_an_unknown_covariance_is_replaced(log, tmp_path):
+    logs = with_fixes(log, tmp_path, (MIDDLE, None), (MIDDLE, (0.0, 0.0, 0.0)), (MIDDLE, (1.0, 1.0, 2.0)))
+    fixes = fixes_of(scanchain.open_log(logs, gnss_topic="/b"))
+    assert sum(len(each.stamps_ns) for each in fixes) == 2
+    sigmas = np.sqrt(np.concatenate([each.covariances for each in fixes]).diagonal(axis1=1, axis2=2))
+    np.testing.assert_allclose(sigmas, [[5.0, 5.0, 10.0], [1.0, 1.0, 2.0]])
+    assert fixes[0].antenna_m is None
+
+
+def test_a_position_that_is_none_on_earth_is_left_out_and_counted(log, tmp_path):
+    logs = with_fixes(log, tmp_path, ((91.0, 0.0, 0.0), (1.0,) * 3), ((np.nan, 0.0, 0.0), (1.0,) * 3))
+    opened = scanchain.open_log(logs, gnss_topic="/b")
+    assert not fixes_of(opened)
+    assert any("2 malformed messages of /b left out" in line for line in opened.damage)
+
+
+def test_none_leaves_it_unused_of_several_none_is_used_and_another_topic_is_refused(log, tmp_path):
+    assert scanchain.open_log(log, gnss_topic="none").gnss is None
+    logs = with_fixes(log, tmp_path, (MIDDLE, (1.0, 1.0, 2.0)))
+    opened = scanchain.open_log(logs)
+    assert opened.gnss is None
+    assert "several GNSS receivers (/b, /fix), none is used; choose with --log.gnss_topic" in opened.notes
+    with pytest.raises(InputError, match=r"log.gnss_topic /odom is not a topic of sensor_msgs/NavSatFix"):
+        scanchain.open_log(log, gnss_topic="/odom")
+    said = describe([log], load_settings(2).config.log)["sensors"]
+    assert [each.use for each in said if each.sensor == "GNSS"] == [
+        "its fixes give the place on Earth, and correct drift where they show any"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"positions": np.zeros((3, 3))}, r"fixes.positions .* \(1, 3\)"),
+        ({"covariances": np.zeros((1, 3, 3))}, "fixes.covariances are not positive definite"),
+        ({"antenna_m": np.zeros(2)}, "fixes.antenna_m"),
+    ],
+)
+def test_fixes_given_in_python_are_checked(changed, words):
+    sound = scanchain.Fixes(np.array([1]), np.array([MIDDLE]), np.eye(3)[None], np.zeros(3))
+    assert scanchain.Scan.of(np.ones((5, 3)), 1.0, fixes=sound).fixes.positions.shape == (1, 3)
+    with pytest.raises(InputError, match=words):
+        scanchain.Scan.of(np.ones((5, 3)), 1.0, fixes=sound._replace(**changed))
+
+
+def test_positions_on_earth_are_those_of_the_ellipsoid_and_of_utm():
+    geodesy = Geodesy(*MIDDLE)
+    points = np.array([[0.0, 0.0, 0.0], [1000.0, 0.0, 0.0], [0.0, 1000.0, 50.0]])
+    found = geodesy.geodetic(points)
+    np.testing.assert_allclose(geodesy.enu(found), points, atol=1e-6)
+    a, e2, sine = 6378137.0, 0.00669437999014, np.sin(np.radians(49.0))
+    prime, meridian = a / np.sqrt(1.0 - e2 * sine**2), a * (1.0 - e2) / (1.0 - e2 * sine**2) ** 1.5  # radii
+    assert found[1, 1] - 8.4 == pytest.approx(
+        np.degrees(1000.0 / ((prime + 100.0) * np.cos(np.radians(49.0)))), 1e-6
+    )
+    assert found[2, 0] - 49.0 == pytest.approx(np.degrees(1000.0 / (meridian + 150.0)), 1e-5)
+    projected, crs = geodesy.projected(points)
+    assert crs.to_epsg() == 32632 and np.linalg.norm(projected[1] - projected[0]) == pytest.approx(999.6, abs=0.3)
+
+
+def test_fixes_that_constrain_a_graph_leave_all_that_is_made_of_it(log, tmp_path, monkeypatch):
+    monkeypatch.setattr("scanchain.georeference._MOST_ALONE", -1.0)  # as if every trajectory drifted
+    slam, opened = scanchain.Slam(dimension=2), scanchain.open_log(log)
+    for scan in opened:
+        slam.process(scan)
+    result = slam.finish()
+    graph, place = result.graph, result.georeference
+    assert place.origin.is_constrained and graph.is_of_origin.sum() > 4
+    assert np.max(lie.apart(result.trajectory.poses[0], np.eye(3))) < 0.05
+    assert np.isfinite(graph.covariances()).all() and scanchain.judge(result).verdict == "trustworthy"
+    scanchain.write_g2o(tmp_path / "graph.g2o", graph)
+    assert scanchain.read_g2o(tmp_path / "graph.g2o").graph.is_of_origin.sum() == graph.is_of_origin.sum()
+
+
+def test_a_run_writes_its_origin_a_track_and_a_map_with_its_coordinate_system(run):
+    origin = json.loads((run / "run.json").read_text())["origin"]
+    truth = scanchain.read_tum(made.log("office", seconds=20.0, gnss="rtk").with_suffix(".tum"))
+    (first,) = Geodesy(*ORIGIN).geodetic((T_ENU_WORLD @ lie.lift(truth.poses[:1]))[:, :3, 3])
+    away_m = Geodesy(*ORIGIN).enu(
+        np.array([[origin[f"{name}_deg"] for name in ("latitude", "longitude")] + [0.0]])
+    )
+    at_m = Geodesy(*ORIGIN).enu(first[None])
+    assert np.linalg.norm((away_m - at_m)[0, :2]) < 3.0 * origin["sigma_m"] < 1.0
+    assert origin["yaw_rad"] == pytest.approx(np.radians(35.0) + lie.yaw(truth.poses[0]), abs=0.02)
+    assert origin["fixes"] > 190 and origin["fixes_rejected"] < 10 and not origin["is_constrained"]
+    enu = scanchain.read_tum(run / "trajectory_enu.tum")
+    track = json.loads((run / "track.geojson").read_text())["geometry"]["coordinates"]
+    geodesy = Geodesy(*(origin[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")))
+    np.testing.assert_allclose(geodesy.enu(np.array(track)[:, [1, 0, 2]]), enu.positions, atol=2e-3)
+    kml = ElementTree.parse(run / "track.kml").getroot()
+    (line,) = kml.iter("{http://www.opengis.net/kml/2.2}coordinates")
+    assert [float(each) for each in line.text.split()[0].split(",")] == track[0]
+    cloud = laspy.read(run / "map.laz")
+    assert cloud.header.parse_crs().to_epsg() == 32632
+    (middle,), _ = geodesy.projected(enu.positions.mean(axis=0, keepdims=True))
+    assert np.linalg.norm(np.mean([cloud.x, cloud.y], axis=1) - middle[:2]) < 20.0
+    assert "note           GNSS: " in (run / "summary.txt").read_text()
