@@ -12,6 +12,7 @@ from contextlib import suppress
 
 import click
 
+from scanchain.commands.calibrate import calibrate
 from scanchain.commands.evaluate import evaluate
 from scanchain.commands.landmarks import landmarks
 from scanchain.commands.logs import convert, doctor, info, simulate
@@ -43,8 +44,8 @@ def scanchain() -> None:
 
 
 for _command in (
-    run, localize, merge, changes, map_group, check, batch, view, compare, info, doctor, convert, simulate,
-    evaluate, optimize, landmarks, config, sequence, warm_up,
+    run, localize, merge, changes, map_group, check, batch, view, compare, info, doctor, calibrate, convert,
+    simulate, evaluate, optimize, landmarks, config, sequence, warm_up,
 ):  # fmt: skip
     scanchain.add_command(_command)
 

@@ -70,6 +70,16 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
         automatically where empty, ``none`` leaves it unused
     gnss_topic : GNSS receiver, ``sensor_msgs/NavSatFix``, which gives the result its place on Earth, see
         ``graph.gnss``; found automatically where empty, ``none`` leaves it unused
+    lidar_pose : pose of the lidar on its base, ``x y z qx qy qz qw``; by the transforms where empty
+    other_lidar_poses : poses of the other lidars in the frame of the first one, separated by commas; by the
+        transforms where empty
+    elevation_offset_rad : angle by which the points of the (first) lidar are raised, a constant error of its own
+    range_offset_m : length that is added to its ranges
+    imu_rotation : rotation of the IMU in the lidar's frame, ``qx qy qz qw``; by the transforms where empty
+    imu_delay_s : how late the stamps of the IMU are
+    odometry_delay_s : how late the stamps of the wheel odometry are
+    odometry_scale : distances by the wheels over true ones; they are divided by it
+    odometry_turn_scale : turns by the wheels over true ones
     upside_down : whether a planar lidar hangs upside down although no transform says so: its scans are mirrored
     start_s : everything before this time, counted from the first message, is skipped
     end_s : everything after this time, counted from the first message, is skipped
@@ -93,6 +103,15 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     ground_truth_topic: str = "/ground_truth"
     imu_topic: str = ""
     gnss_topic: str = ""
+    lidar_pose: str = ""
+    other_lidar_poses: str = ""
+    elevation_offset_rad: Number = 0.0
+    range_offset_m: Number = 0.0
+    imu_rotation: str = ""
+    imu_delay_s: Number = 0.0
+    odometry_delay_s: Number = 0.0
+    odometry_scale: Positive = 1.0
+    odometry_turn_scale: Positive = 1.0
     upside_down: bool = False
     start_s: NonNegative = 0.0
     end_s: Limit = float("inf")

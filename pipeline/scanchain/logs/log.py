@@ -36,9 +36,9 @@ from scanchain.logs.mounting import (
     is_upside_down,
 )
 from scanchain.logs.opening import index_files
-from scanchain.logs.other_lidars import OtherLidar, Together, decoder
+from scanchain.logs.other_lidars import Together, decoder, other_lidars
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
-from scanchain.logs.samples import HOLD_SCANS, NEAREST_NS, Recorded
+from scanchain.logs.samples import HOLD_SCANS, NEAREST_NS, Recorded, ScaledOdometry
 from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidars
 from scanchain.settings import load_settings, overrides_of
@@ -129,9 +129,9 @@ class Log:
         self.publishers = Publishers(
             of_part, partial(between_frames, indexes, self.span), is_planar=self.dimension == 2
         )
-        self.others = [OtherLidar(indexes, each, config, self.publishers, self.notes) for each in others]
+        self.others = other_lidars(indexes, others, config, self.publishers, self.notes)
         wheels = find_wheels(indexes, self.publishers.frame, config, self.span, self.notes)
-        self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
+        self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span, config)
         self.gaps = stream.gap_notes(indexes, config)  # the notes on long gaps
         topic = wheels.channel.topic if wheels else ""
         self.notes += self.publishers.notes + ([self.sectors.note(self.topic)] if self.sectors else [])
@@ -196,7 +196,12 @@ class Log:
         self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
         recorded = Recorded(
-            self.odometry_topic, self.ground_truth_topic, self.imu, self.gnss, is_mirrored=self.is_mirrored
+            self.odometry_topic,
+            self.ground_truth_topic,
+            self.imu,
+            self.gnss,
+            is_mirrored=self.is_mirrored,
+            delays_s=(self.config.odometry_delay_s, self.config.imu_delay_s),
         )
         counts = ScanCounts(self.topic, self.odometry_topic)
         self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
@@ -331,6 +336,7 @@ class Log:
     ) -> Iterator[tuple[Decoded, Pose | None]]:
         """Scans with the wheel odometry pose at their stamp; they are held back briefly for samples after them."""
         decoders = {self.topic: self.decoder(self.times), **self.together.decoders, **self.sample_decoders}
+        scaled = ScaledOdometry(self.config.odometry_scale, self.config.odometry_turn_scale)
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
         messages = messages if assembler is None else assembler.sweeps(messages)
@@ -350,7 +356,7 @@ class Log:
             ):
                 scan = waiting.popleft()
                 wheels = recorded.odometry.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
-                yield scan, wheels and wheels.T_parent_child
+                yield scan, wheels and scaled.corrected(wheels.T_parent_child)
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` records what is assumed about the point times."""

@@ -11,7 +11,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import NO_TOPIC, LogConfig
 from scanchain.data import Pose, Vector
-from scanchain.errors import InputError
+from scanchain.errors import InputError, shown
 from scanchain.logs.index import Channel, FileIndex, name_of
 from scanchain.logs.messages.gnss import Fix
 from scanchain.logs.messages.inertial import ImuSample
@@ -149,6 +149,9 @@ def find_sensors(
     imu = _only(indexes, "imu", config.imu_topic, notes)
     gnss = _only(indexes, "gnss", config.gnss_topic, notes)
     T_imu, T_gnss = (each and _on_lidar(indexes, each, frame, span) for each in (imu, gnss))
+    for T_rotation in stated_poses(config.imu_rotation, "log.imu_rotation"):
+        T_imu = np.eye(4) if T_imu is None else T_imu.copy()
+        T_imu[:3, :3] = T_rotation[:3, :3]
     antenna_m = None if T_gnss is None else T_gnss[:3, 3]
     return imu and Imu(imu.topic, reader(imu), T_imu), gnss and Gnss(gnss.topic, reader(gnss), antenna_m)
 
@@ -187,12 +190,16 @@ class MovingFrame(NamedTuple):
     T_lidar_frame: Pose
 
 
-def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | None, span: Span) -> Mounting:
+def find_mounting(
+    indexes: Sequence[FileIndex], frame: str, wheels: Wheels | None, span: Span, config: LogConfig
+) -> Mounting:
     """Mounting of the lidar with ``frame`` (empty if it has none), from the chosen part of a log."""
     base_of_wheels = wheels.link[1] if wheels and wheels.link else ""
     if wheels is not None and role(wheels.channel) == "odometry":
         stated = next(sampled_messages(indexes, wheels.channel.topic, pose_reader(wheels.channel, 3)), None)
         base_of_wheels = "" if stated is None else stated.value.child
+    for T in stated_poses(config.lidar_pose, "log.lidar_pose"):
+        return Mounting(base_of_wheels, T, "by log.lidar_pose")
     bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
     if (stated := _stated(indexes, bases, frame, span)) is not None:
         return stated
@@ -206,6 +213,22 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
     mounting = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
     note = f"no static transform from {bases[0]} to {frame or 'the lidar'}: the mounting {mounting}"
     return Mounting("", np.eye(4), note=note if fixed or wheels else "", is_stated=False)
+
+
+def stated_poses(text: str, key: str) -> list[Pose]:
+    """Poses (4, 4) of a configuration key, ``x y z qx qy qz qw`` or ``qx qy qz qw``, separated by commas."""
+    poses = list[Pose]()
+    for words in filter(None, text.split(",")):
+        try:
+            numbers = np.array([float(word) for word in words.split()])
+        except ValueError:
+            numbers = np.empty(0)
+        if len(numbers) not in (4, 7) or not np.isfinite(numbers).all() or not numbers[-4:].any():
+            raise InputError(f"{key} is {shown(words)}; wanted x y z qx qy qz qw, a rotation qx qy qz qw")
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = lie.from_quaternion(numbers[-4:]), numbers[:-4] if len(numbers) == 7 else 0.0
+        poses.append(T)
+    return poses
 
 
 def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source: str) -> Pose | None:

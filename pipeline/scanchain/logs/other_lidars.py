@@ -13,13 +13,19 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
-from scanchain.data import OtherPoints
+from scanchain.data import OtherPoints, Pose
 from scanchain.errors import InputError, counted, duration
 from scanchain.logs.index import Channel, Decoded, FileIndex, name_of
-from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
+from scanchain.logs.messages.lidar import (
+    Returns,
+    decode_cloud,
+    decode_laser_scan,
+    plane_height_m,
+    with_offsets,
+)
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 from scanchain.logs.messages.readers import is_scan, reader
-from scanchain.logs.mounting import place_text
+from scanchain.logs.mounting import place_text, stated_poses
 from scanchain.logs.publishers import Publishers, in_first_frame
 from scanchain.logs.samples import HOLD_SCANS, NEAREST_NS
 from scanchain.logs.stream import sampled_messages
@@ -32,32 +38,53 @@ _ABSENT = 2.5  # time without a lidar, in usual intervals between scans with it,
 
 def decoder(channel: Channel, times: PointTimes, plane_m: float | None) -> Callable[[memoryview], Returns]:
     """Decoder of a lidar's messages to points; ``plane_m`` is the height of the plane of planar clouds."""
+    decode = partial(decode_cloud, read=reader(channel), times=times, plane_m=plane_m)
     if is_scan(channel):
-        return partial(decode_laser_scan, read=reader(channel), config=times.config)
-    return partial(decode_cloud, read=reader(channel), times=times, plane_m=plane_m)
+        decode = partial(decode_laser_scan, read=reader(channel), config=times.config)
+    offsets = times.config.elevation_offset_rad, times.config.range_offset_m
+    return partial(_corrected, decode=decode, offsets=offsets) if any(offsets) else decode
+
+
+def _corrected(
+    data: memoryview, *, decode: Callable[[memoryview], Returns], offsets: tuple[float, float]
+) -> Returns:
+    returns = decode(data)
+    points = with_offsets(returns.points.astype(np.float64), *offsets).astype(np.float32)
+    return returns._replace(points=points)
 
 
 class OtherLidar:
     """A lidar whose points are added to the scans of the first one.
 
+    T_first_other : its pose in the frame of the first one
     waiting, end_ns : points that wait for their scan, with their times (N,), and the time of the last one
     scans : log time of each scan of the first lidar, and whether it has points of this one
     faults : defects of the messages that are left out
     """
 
     def __init__(
-        self, indexes: Sequence[FileIndex], lidar: Channel, config: LogConfig, first: Publishers, notes: list[str]
+        self,
+        indexes: Sequence[FileIndex],
+        lidar: Channel,
+        config: LogConfig,
+        first: Publishers,
+        notes: list[str],
+        T_stated: Pose | None,
     ) -> None:
-        """Add its pose to ``notes``. Raises InputError if its points cannot be moved to the frame of the first."""
+        """Add its pose to ``notes``: ``T_stated``, or by the transforms.
+
+        Raises InputError if its points cannot be moved to the frame of the first.
+        """
         unit = config.point_times if config.point_times in (*UNITS_S, "none") else "auto"  # not by azimuth
-        self.channel, self.config = lidar, replace(config, point_times=unit, every=1)
+        own = {"point_times": unit, "every": 1, "elevation_offset_rad": 0.0, "range_offset_m": 0.0}
+        self.channel, self.config = lidar, replace(config, **own)
         decode = decoder(lidar, PointTimes(self.config), None)
         sampled = list(sampled_messages(indexes, lidar.topic, decode, most=_SAMPLED))
         self.plane_m = None if is_scan(lidar) else plane_height_m(each.value for each in sampled)
         offsets_ns = [each.value.stamp_ns - each.log_time_ns for each in sampled]
         of_first_ns = [offset_ns for _, offset_ns in first.offsets_ns]
         away_ns = float(np.median(offsets_ns) - np.median(of_first_ns)) if sampled and of_first_ns else 0.0
-        self.pose = cache(partial(first.joined, away_ns=away_ns))  # by frame
+        self.pose = cache(partial(first.joined, away_ns=away_ns, T_stated=T_stated))  # by frame
         T, why = self.pose(sampled[0].value.frame) if sampled else (None, "no message of it can be understood")
         if sampled and (is_scan(lidar) or self.plane_m is not None) != first.is_planar:
             why = "one is planar, the other is not"
@@ -65,6 +92,7 @@ class OtherLidar:
             topic = config.topic.partition(",")[0]
             why = f"cannot be combined with {topic}: {why}; use one of them, as --topic {topic}"
             raise InputError(f"{name_of(indexes)}: {lidar.topic} {why}")
+        self.T_first_other = T
         notes.append(f"{lidar.topic} is used too, moved to frame {first.frame}: it is at {place_text(T)}")
         self.begin()
 
@@ -118,6 +146,21 @@ class OtherLidar:
         when = when if len(found) else f"not used: no point is within {1e-9 * _TOGETHER_NS:g} s of a scan"
         scans = f"{missed} of {counted(len(times_ns), 'scan')} of {first} without {self.channel.topic}"
         return f"{scans}, which is {when}" if missed else ""
+
+
+def other_lidars(
+    indexes: Sequence[FileIndex],
+    channels: Sequence[Channel],
+    config: LogConfig,
+    first: Publishers,
+    notes: list[str],
+) -> list[OtherLidar]:
+    """The lidars of these channels, at the poses of the configuration or the transforms."""
+    stated = stated_poses(config.other_lidar_poses, "log.other_lidar_poses") or [None] * len(channels)
+    if len(stated) != len(channels):
+        wanted = f"as many as topics after the first of log.topic, {len(channels)}"
+        raise InputError(f"log.other_lidar_poses has {counted(len(stated), 'pose')}; wanted {wanted}")
+    return [OtherLidar(indexes, each, config, first, notes, T) for each, T in zip(channels, stated, strict=True)]
 
 
 class Together:

@@ -69,9 +69,11 @@ class Publishers:
             self.known[frame] = self._further(frame, f"frame {frame or 'without a name'}")
         return self.known[frame]
 
-    def joined(self, frame: str, away_ns: float) -> tuple[Pose, str]:
+    def joined(self, frame: str, away_ns: float, T_stated: Pose | None = None) -> tuple[Pose, str]:
         """T_first_frame of a frame, and why its points cannot be moved by it; empty if they can."""
-        T = self.between(self.frame, frame) if frame != self.frame else np.eye(4)
+        T = T_stated
+        if T is None:
+            T = self.between(self.frame, frame) if frame != self.frame else np.eye(4)
         if abs(away_ns) > _STEP_NS:
             side = "ahead of" if away_ns > 0 else "behind"
             return np.eye(4), f"its clock is {duration(1e-9 * abs(away_ns))} {side} that of frame {self.frame}"

@@ -8,6 +8,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
+from scanchain import lie
 from scanchain.data import Fixes, Inertial, Pose, Trajectory
 from scanchain.errors import counted
 from scanchain.logs.index import Decoded
@@ -82,6 +83,25 @@ class SampleStream(Generic[S]):
         return near[0] if near else None
 
 
+class ScaledOdometry:
+    """Wheel odometry whose motions from scan to scan are divided by the scales of distances and of turns."""
+
+    def __init__(self, scale: float, turn_scale: float) -> None:
+        self.scale, self.turn_scale = scale, turn_scale
+        self.last: tuple[Pose, Pose] | None = None  # as read, and corrected
+
+    def corrected(self, T_odom_base: Pose) -> Pose:
+        """The pose at the next scan."""
+        if self.scale == self.turn_scale == 1.0:
+            return T_odom_base
+        T = T_odom_base
+        if self.last is not None:
+            by_component = lie.by_component(lie.twist_size(T), self.scale, self.turn_scale)
+            T = self.last[1] @ lie.exp(lie.log(lie.between(self.last[0], T_odom_base)) / by_component)
+        self.last = T_odom_base, T
+        return T
+
+
 class Recorded:
     """Messages of the sensors next to the lidar, sorted by topic; malformed ones are counted.
 
@@ -90,10 +110,21 @@ class Recorded:
     """
 
     def __init__(
-        self, odometry_topic: str, ground_truth_topic: str, imu: Imu | None = None, gnss: Gnss | None = None, *,
+        self,
+        odometry_topic: str,
+        ground_truth_topic: str,
+        imu: Imu | None = None,
+        gnss: Gnss | None = None,
+        *,
         is_mirrored: bool = False,
-    ) -> None:  # fmt: skip
-        """is_mirrored : whether a planar lidar hangs upside down; its frame is then as seen from above."""
+        delays_s: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """is_mirrored : whether a planar lidar hangs upside down; its frame is then as seen from above.
+
+        delays_s : how late the stamps of wheel odometry and IMU are
+        """
+        topics = odometry_topic, "" if imu is None else imu.topic
+        self._delays_ns = {topic: round(1e9 * delay_s) for topic, delay_s in zip(topics, delays_s, strict=True)}
         self.odometry, self.imu = SampleStream[StampedPose](), SampleStream[ImuSample]()
         self.T_lidar_imu = None if imu is None else imu.T_lidar_imu
         if self.T_lidar_imu is not None and is_mirrored:
@@ -120,7 +151,10 @@ class Recorded:
             if topic == self.ground_truth_topic:
                 self.truth.append(sample)
             if topic in self.streams:
-                self.streams[topic].add(sample)
+                delay_ns = self._delays_ns[topic]
+                self.streams[topic].add(
+                    sample._replace(stamp_ns=sample.stamp_ns - delay_ns) if delay_ns else sample
+                )
             if isinstance(sample, Fix):
                 self._fixes.append(sample)
 

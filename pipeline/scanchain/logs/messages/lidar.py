@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
-from scanchain.data import Pose, RawPoints
+from scanchain.data import Points, Pose, RawPoints
 from scanchain.errors import one_line
-from scanchain.kernels.scans import keep_valid
+from scanchain.kernels.scans import keep_valid, raise_elevation
 from scanchain.logs.messages.point_times import NO_TIMES, UNITS_S, Beams, PointTimes, Returns, from_azimuth
 from scanchain.logs.messages.ros import (
     NUMBERS,
@@ -217,6 +217,14 @@ def moved(points: RawPoints, T: Pose | None) -> RawPoints:
     """Points (N, d) transformed by a pose (4, 4); None is the identity."""
     d = points.shape[1]
     return points if T is None else (points @ T[:d, :d].T + T[:d, 3]).astype(np.float32)
+
+
+def with_offsets(points: Points, elevation_rad: float, range_m: float) -> Points:
+    """Points (N, d) in the lidar's own frame, raised, if d = 3, and their ranges lengthened."""
+    if points.shape[1] == 3 and elevation_rad:
+        points = raise_elevation(np.ascontiguousarray(points, np.float64), elevation_rad)
+    lengths_m = np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
+    return points * (1.0 + range_m / lengths_m)
 
 
 def _why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:

@@ -1,0 +1,202 @@
+"""Calibration of IMU and wheels by the motions of the scans: mounting, scales and delays by least squares."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from scanchain import lie
+from scanchain.data import Mask, Matrix, Pose, Vector
+from scanchain.registration.hand_eye import hand_eye, path_m
+
+_STEPS, _STEP = 20, 0.01  # most Gauss-Newton steps; step of a converged parameter, in standard deviations
+_BLOCK = 4  # consecutive motions whose errors may depend on each other
+_KERNEL = 2.0  # normalized residual at which a motion has half its weight
+_DIFFERENCE = 1e-6  # of numerical derivatives
+_MOVING = 0.2  # share of the length of a fast motion below which wheels are taken to stand
+_MOST_DELAY_S, _DELAY_STEP_S = 1.0, 0.02  # of the wheels' stamps against those of the scans, searched at first
+_GYRO_PRIOR = np.array([0.2] * 3 + [0.1] * 3 + [0.2])  # σ of rotation, bias and delay
+_WHEELS_PRIOR = np.array([1.0, 1.0, 0.2, 0.2, 0.2, 0.2, 0.2, 0.05, 0.3])  # of the parameters of ``Wheels``
+_CLOCK_S = 0.002  # σ of the instants of poses: scans are deskewed at constant velocity
+_APART_S, _ODDS = 0.1, 10.0  # distinct delays, and least log-likelihood ratio against any other
+# σ that the residuals do not show: angles and scale of the scans' own poses, the clock
+_OF_WHEELS = np.array([0.0, 0.0, 1e-3, 1e-3, 0.0, 0.002, 0.0, 0.0, _CLOCK_S])
+FEWEST = 30  # least number of motions
+
+
+class Motions(NamedTuple):
+    """Motions of the lidar from scan to scan: times (M, 2) in seconds, poses (M, d+1, d+1) in the scan before."""
+
+    ends_s: Vector
+    T: Matrix
+
+    def where(self, mask: Mask) -> Motions:
+        """Some of them."""
+        return Motions(self.ends_s[mask], self.T[mask])
+
+
+class Fit(NamedTuple):
+    """Parameters (m,) with their covariance (m, m)."""
+
+    x: Vector
+    covariance: Matrix
+
+    @property
+    def sigmas(self) -> Vector:
+        """Standard deviations (m,)."""
+        return np.sqrt(self.covariance.diagonal())
+
+
+def fitted(residuals: Callable[[Vector], Matrix], first: Vector, prior: Vector) -> Fit:
+    """Robust least squares (Cauchy) of residuals (M, q), whose derivatives are numerical.
+
+    Each component is normalized by its median. The covariance is that of a sandwich estimator over blocks of
+    consecutive motions, since two share the error of the pose between them, and no less than the usual one.
+
+    prior : (m,) standard deviations around ``first``, which determine what the motions do not
+    """
+    x, m, covariance = first, len(first), np.diag(prior**2)
+    P = np.diag(prior**-2.0)
+    for _ in range(_STEPS):
+        r = residuals(x)
+        J = np.stack([(residuals(x + each) - r) / _DIFFERENCE for each in _DIFFERENCE * np.eye(m)], axis=-1)
+        sigma = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9)
+        r, J = r / sigma, J / sigma[:, None]
+        weight = 1.0 / (1.0 + np.mean(r**2, axis=1) / _KERNEL**2)
+        scores = np.einsum("mqi,mq,m->mi", J, r, weight)
+        inverse = np.linalg.inv(np.einsum("mqi,mqj,m->ij", J, J, weight) + P)
+        blocks = np.add.reduceat(scores, np.arange(0, len(scores), _BLOCK))
+        count = len(blocks)
+        covariance = inverse @ (count / max(count - m, 1) * blocks.T @ blocks + P) @ inverse
+        larger = np.sqrt(np.maximum(inverse.diagonal() / covariance.diagonal(), 1.0))
+        covariance *= np.outer(larger, larger)
+        step = -inverse @ (scores.sum(axis=0) + P @ (x - first))
+        x = x + step
+        if np.all(np.abs(step) < _STEP * np.sqrt(covariance.diagonal())):
+            break
+    return Fit(x, covariance)
+
+
+def fit_gyro(motions: Motions, times_s: Vector, rates: Matrix, axes: Matrix, delay_s: float) -> Fit | None:
+    """Rotation (3,) of the axes, bias (3,) in rad/s and delay in s of a gyro; None with too few motions.
+
+    The residual of each motion is Log(R) − exp(φ) A ∫ω dt + b Δt.
+
+    axes : A (3, 3), with the unit of the rates (M, 3); delay_s : at first, to 0.2 s
+    """
+    integral = cumulative_trapezoid(rates, times_s, axis=0, initial=0.0) @ axes.T
+    begin_s, end_s = times_s[[0, -1]] + np.array([1.0, -1.0]) * (_GYRO_PRIOR[-1] + abs(delay_s))
+    motions = motions.where((motions.ends_s[:, 0] > begin_s) & (motions.ends_s[:, 1] < end_s))
+    if len(motions.T) < FEWEST:
+        return None
+    turns, lasted_s = lie.log(lie.lift(motions.T))[:, 3:], np.diff(motions.ends_s, axis=1)
+
+    def residuals(x: Vector) -> Matrix:
+        at = motions.ends_s + x[6]
+        ends = np.stack([np.interp(at, times_s, each) for each in integral.T], axis=-1)
+        R = lie.exp(np.concatenate([np.zeros(3), x[:3]]))[:3, :3]
+        return turns - (ends[:, 1] - ends[:, 0]) @ R.T + lasted_s * x[3:6]
+
+    starts = [np.array([0.0] * 6 + [delay_s + each]) for each in np.linspace(-0.2, 0.2, 41).tolist()]
+    first = min(starts, key=lambda start: float(np.abs(residuals(start)).sum()))
+    fit = fitted(residuals, first, _GYRO_PRIOR)
+    return Fit(fit.x, fit.covariance + np.diag([0.0] * 6 + [_CLOCK_S**2]))
+
+
+class Wheels(NamedTuple):
+    """The mounting T_base_lidar, corrected, with a fit of its corrections.
+
+    fit : of x and y in m, of roll, pitch and yaw in the base's frame, of the scales of distances and of turns
+        minus 1, of the turn per meter in rad and of the delay in s
+    """
+
+    T_base_lidar: Pose
+    fit: Fit
+
+
+class _Base:
+    """Motions of the base by planar poses (M, 3, 3) of wheels, their path averaged over two samples.
+
+    Otherwise delays halfway between samples, where the noise is less, fit better.
+    """
+
+    def __init__(self, times_s: Vector, poses: Matrix) -> None:
+        path = np.column_stack([poses[:, 0, 2], poses[:, 1, 2], np.unwrap(lie.yaw(poses))])
+        self.times_s, self.integral = times_s, cumulative_trapezoid(path, times_s, axis=0, initial=0.0)
+        self.width_s = 2.0 * float(np.median(np.diff(times_s)))
+
+    def over(self, motions: Motions, delay_s: float) -> Matrix:
+        """(M, 3, 3) over each motion, ``delay_s`` later by their stamps."""
+        at = motions.ends_s + delay_s + 0.5 * self.width_s * np.array([-1.0, 1.0])[:, None, None]
+        x, y, yaw = (
+            np.diff(np.interp(at, self.times_s, each), axis=0)[0] / self.width_s for each in self.integral.T
+        )
+        T = lie.exp(np.stack([np.zeros_like(yaw)] * 2 + [yaw], axis=-1))
+        T[..., 0, 2], T[..., 1, 2] = x, y
+        return lie.between(T[:, 0], T[:, 1])
+
+
+def fit_wheels(motions: Motions, times_s: Vector, poses: Matrix, T_base_lidar: Pose | None) -> Wheels | None:
+    """Mounting, scales and delay of wheels from their planar poses (M, 3, 3); None where they hardly move.
+
+    The base is taken to move in its own plane: so a lidar in space shows roll and pitch, too.
+
+    T_base_lidar : as stated; None where the log does not state it: then it is found in closed form
+    """
+    base = _Base(times_s, poses)
+    begin_s, end_s = times_s[0] + _MOST_DELAY_S, times_s[-1] - _MOST_DELAY_S
+    motions = motions.where((motions.ends_s[:, 0] > begin_s) & (motions.ends_s[:, 1] < end_s))
+    if len(motions.T) < FEWEST:
+        return None
+    lengths, turns = path_m(motions.T), lie.log(motions.T)[:, -1]
+    delays_s = np.arange(-_MOST_DELAY_S, _MOST_DELAY_S, _DELAY_STEP_S)
+    odds = np.array([_log_likelihood(base.over(motions, each), lengths, turns) for each in delays_s.tolist()])
+    first_s = float(delays_s[odds.argmax()])
+    is_late = odds.max() - odds[np.abs(delays_s - first_s) > _APART_S].max() > _ODDS  # else any delay fits
+    first_s = first_s if is_late else 0.0
+    motions = motions.where(lengths > max(_MOVING * float(np.quantile(lengths, 0.9)), 1e-3))
+    if len(motions.T) < FEWEST:
+        return None
+    if T_base_lidar is None:
+        moved = base.over(motions, first_s)
+        found = hand_eye(lie.lift(moved) if motions.T.shape[-1] == 4 else moved, motions.T)
+        T_base_lidar = lie.identity(motions.T.shape[-1] - 1) if found is None else found.T_base_lidar
+    T_first, is_planar = T_base_lidar, len(T_base_lidar) == 3
+
+    def mounting(x: Vector) -> Pose:
+        T = lie.lift(T_first)
+        turned = lie.exp(np.concatenate([np.zeros(3), x[2:5]])) @ T
+        turned[:3, 3] = T[:3, 3] + [x[0], x[1], 0.0]
+        return turned
+
+    def residuals(x: Vector) -> Matrix:
+        T = mounting(x)
+        by_scans = lie.log(T @ lie.lift(motions.T) @ lie.inverse(T))
+        by_scans *= lie.by_component(6, 1.0 + x[5], 1.0 + x[6])
+        by_scans[:, 5] += x[7] * by_scans[:, 0]
+        error = lie.log(lie.between(lie.exp(by_scans), lie.lift(base.over(motions, x[8]))))
+        return error[:, [0, 1, 5]] if is_planar else error
+
+    prior = _WHEELS_PRIOR.copy()
+    prior[2:4] = 1e-6 if is_planar else prior[2:4]
+    first = np.array([0.0] * 8 + [first_s])
+    noise, signal = residuals(first)[:, -1], lie.log(motions.T)[:, -1]
+    prior[8] = prior[8] if is_late else 1e-6
+    fit = fitted(residuals, first, prior)
+    systematic = _OF_WHEELS.copy()
+    systematic[6] += float(np.median(noise**2) / max(np.mean(signal**2), 1e-12))  # attenuation by noise
+    systematic[8] += 0.25 * base.width_s if is_late else _MOST_DELAY_S
+    fit = Fit(fit.x, fit.covariance + np.diag(systematic**2))
+    T = mounting(fit.x)
+    return Wheels(lie.flatten(T) if is_planar else T, fit)
+
+
+def _log_likelihood(base: Matrix, lengths: Vector, turns: Vector) -> float:
+    """Log-likelihood of motions of the wheels, linear in the lengths and in the turns by the scans."""
+    pairs = ((path_m(base), lengths), (np.abs(lie.log(base)[:, -1]), np.abs(turns)))
+    correlations = (float(np.corrcoef(a, b)[0, 1]) for a, b in pairs if np.ptp(a) > 0.0 and np.ptp(b) > 0.0)
+    return sum(-0.5 * len(lengths) * math.log(max(1.0 - max(each, 0.0) ** 2, 1e-9)) for each in correlations)
