@@ -178,7 +178,7 @@ def test_while_it_predicts_worse_than_the_last_motion_it_is_not_used():
 
 FAULTS = {
     "mems": "",
-    "mems-g": "",
+    "mems-g": "its accelerations are in g: converted",
     "mems-half-late": "",
     "mems-vibration": "",
     "mems-no-transform": "",
