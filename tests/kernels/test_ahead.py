@@ -179,3 +179,8 @@ def test_the_table_has_what_runs_call(kind, tmp_path):
     table = [row[1:] for row in json.loads(ahead.TABLE.read_text())["kernels"] if kind in row[0]]
     assert len(called) > 20
     assert [each for each in called if each not in table] == []
+
+
+def test_every_kernel_in_the_table_takes_as_many_arguments_as_it_is_compiled_for():
+    for each in ahead.signatures():
+        assert ahead._named(each.kernel).py_func.__code__.co_argcount == len(each.types), each.kernel
