@@ -219,7 +219,7 @@ class Georeferencing:
         return True
 
     def _show_drift(self, ends: _Sighted, d: int) -> bool:
-        """Whether independent fixes contradict the shape of the trajectory, together or several of them alone."""
+        """True if independent fixes, together or several of them alone, contradict the trajectory's shape."""
         chi2 = ends.chi2(self.T_enu_world)
         alone = np.mean(self.variance * chi2 > rejection_limit(self.config.robust_scale, d))
         return bool(chi2.sum() > 2.0 * gammaincinv(0.5 * d * len(chi2), _SURE) or alone > _MOST_ALONE)

@@ -285,7 +285,7 @@ class Predictor:
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Update by the pose of a scan: that of its match or, if lost, the predicted one."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
-        continued = prediction.T_odom_last @ self.T_previous_current
+        before = self.T_previous_current
         self.lost_s = self.lost_s + prediction.interval_s if state is State.LOST else 0.0
         if self.intervals.last_scan is not None:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
@@ -294,6 +294,7 @@ class Predictor:
         is_known = self.scans > 0 and not scan.clock_jump_s and _shows_rotation(match, state)
         self.gyro.correct(self.T_previous_current if is_known else None)
         if self.gyro.size == 3 and self.gyro.blocks:
+            continued = prediction.T_odom_last @ before
             self.accelerometer.correct(T_odom_lidar, None if state is State.LOST else match, continued[:3, 3])
         self.scans += 1
         is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)

@@ -207,8 +207,9 @@ def write_results(folder: Path, results: Results) -> None:
         poses = trajectory.poses @ lie.inverse(log.T_base_lidar)
         write_tum(folder / "trajectory_base.tum", Trajectory(trajectory.stamps_ns, poses))
     if (place := result.georeference) is not None:
-        write_tum(folder / "trajectory_enu.tum", place.enu(trajectory))
-        write_track(folder, Path(str(log.paths[0])).stem, place.enu(trajectory), place)
+        path = place.enu(trajectory)
+        write_tum(folder / "trajectory_enu.tum", path)
+        write_track(folder, Path(str(log.paths[0])).stem, path, place)
     write_g2o(folder / GRAPH_FILE, graph)
     if graph.is_rejected.any():
         write_g2o(rejected_path(folder / GRAPH_FILE), graph, edges="rejected")
