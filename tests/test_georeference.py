@@ -21,7 +21,7 @@ def located(drive, fixes, yaw_rad_m=0.0, config=None):
     """Place on Earth, trajectory in the end, and ATE before and after."""
     truth = drive.truth()
     trajectory, graph, chosen = driven(truth, yaw_rad_m)
-    found = Georeferencing([fixes], drive.T_base_lidar, config or GraphConfig())
+    found = Georeferencing([fixes], lie.lift(drive.T_base_lidar)[2, :3], config or GraphConfig())
     before, constrained = trajectory, found.constrained(trajectory, graph, chosen)
     if constrained is not None:
         trajectory = Trajectory(truth.stamps_ns, spread(constrained.poses, chosen, before.poses))
@@ -125,7 +125,7 @@ def test_fixes_at_one_place_tell_nothing():
     still = fixes._replace(positions=fixes.positions[0] + noise)
     truth = drive.truth()
     standing = Trajectory(truth.stamps_ns, np.tile(np.eye(4), (len(truth), 1, 1)))
-    found = Georeferencing([still], drive.T_base_lidar, GraphConfig())
+    found = Georeferencing([still], lie.lift(drive.T_base_lidar)[2, :3], GraphConfig())
     _, graph, chosen = driven(standing)
     assert found.constrained(standing, graph, chosen) is None and found.place(standing) is None
     assert "far enough apart" in found.note

@@ -117,6 +117,19 @@ class Inertial(NamedTuple):
         return Inertial(stamps_ns, rates, accelerations, T)
 
 
+class RestForce(NamedTuple):
+    """What an accelerometer would measure at rest, along the axes of the lidar, in m/s².
+
+    force, covariance : specific force (3,), its bias included, and covariance (3, 3)
+    bias, bias_covariance : (3,) as far as it is known, and covariance (3, 3)
+    """
+
+    force: Vector
+    covariance: Matrix
+    bias: Vector
+    bias_covariance: Matrix
+
+
 class Fixes(NamedTuple):
     """Fixes of a GNSS receiver.
 

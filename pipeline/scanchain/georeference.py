@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct
-from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
 from scanchain import lie
@@ -17,9 +16,11 @@ from scanchain.config import GraphConfig
 from scanchain.data import Fixes, Integers, Mask, Matrix, Points, Pose, Trajectory, Vector, brief
 from scanchain.errors import counted
 from scanchain.geodesy import Geodesy
-from scanchain.graph.factors import ORIGIN, Position, Prior, RobustPosition
+from scanchain.graph.consistency import is_bent
+from scanchain.graph.factors import Position, Prior, RobustPosition
 from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.gravity import upright
 
 _CORRELATED_S, _SPACING_S = 20.0, 5.0  # time constant of the errors of fixes, and usual time between those used
 _FEWEST, _INTERVALS = 4, 12  # least number of them that agree, and number of intervals of a short log
@@ -146,7 +147,8 @@ class Georeferencing:
     note : what was found, as text
     """
 
-    def __init__(self, fixes: Sequence[Fixes], T_base_lidar: Pose, config: GraphConfig) -> None:
+    def __init__(self, fixes: Sequence[Fixes], up: Vector, config: GraphConfig) -> None:
+        """Take the fixes of a log; ``up`` (3,) is the upward direction in its world, known to a few degrees."""
         stamps_ns = np.concatenate([each.stamps_ns for each in fixes])
         positions = np.concatenate([each.positions for each in fixes])
         covariances = np.concatenate([each.covariances for each in fixes])
@@ -156,9 +158,8 @@ class Georeferencing:
         self.stamps_ns, self.covariances = stamps_ns[order], covariances[order] + _LEAST_M**2 * np.eye(3)
         self.geodesy = Geodesy(*positions[order[0]].tolist())
         self.enu_m = self.geodesy.enu(positions[order])
-        self.antenna_m, self.config, self.note = fixes[0].antenna_m, config, ""
+        self.antenna_m, self.up, self.config, self.note = fixes[0].antenna_m, up, config, ""
         self.estimates_antenna = self.antenna_m is None
-        self.up = lie.lift(T_base_lidar)[2, :3]  # in the frame of the lidar, and so at first in the world
         self.chosen = self.keyframes = np.empty(0, np.int64)  # independent fixes that agree with the trajectory
         self.T_enu_world, self.variance, self.is_constrained = np.eye(4), 1.0, False
 
@@ -176,16 +177,15 @@ class Georeferencing:
         if not self._show_drift(ends, graph.dimension):
             return None
         T_enu_world, constrained, state = self.T_enu_world, graph, graph.state()
-        before = state.edge_chi2[~state.is_rejected]
         for _ in range(3):  # each with the datum for which the first pose of the last one stays where it is
             moved = state.poses[0] @ lie.inverse(graph.poses[0])
             T_enu_world = lie.normalize(T_enu_world @ lie.lift(moved))
-            constrained = graph.copy()
+            constrained = graph.copy()  # without the priors of the first pose, which gets another one
+            constrained.remove_edges(constrained.is_of_origin & (constrained.edges[:, 1] == 0))
             poses = (lie.inverse(moved) @ state.poses)[self.keyframes]
             _constrain(constrained, self.keyframes, poses, ends, T_enu_world, self.up, Position())
             state = constrained.optimize(self.config, initialize="given").state
-        bent = state.edge_chi2[state.edges[:, 0] != ORIGIN][~graph.state().is_rejected] - before
-        if bent.max() > rejection_limit(self.config.robust_scale, graph.freedom) or bent.mean() > graph.freedom:
+        if is_bent(graph.state(), state, self.config.robust_scale):
             self.note = "its fixes contradict the lidar by more than its standard deviations"
             return None
         self.is_constrained = True
@@ -276,7 +276,7 @@ def _consensus(sighted: _Sighted, up: Vector) -> Pose | None:
     Candidates are the horizontal directions and the means of pairs (random sample consensus, over all pairs).
     """
     level = np.eye(4)
-    level[:3, :3] = _upright(up)
+    level[:3, :3] = upright(up)
     count = len(sighted.stamps_ns)
     votes = sighted.chosen(np.unique(np.linspace(0, count - 1, min(count, _VOTES)).astype(int)))
     pairs = np.unique(np.linspace(0, len(votes.stamps_ns) - 1, min(count, _COMPARED)).astype(int))
@@ -303,11 +303,6 @@ def _consensus(sighted: _Sighted, up: Vector) -> Pose | None:
     return best @ level
 
 
-def _upright(up: Vector) -> Matrix:
-    """A rotation (3, 3) that makes a unit vector vertical."""
-    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
-
-
 def _apart(sighted: _Sighted, T_enu_world: Pose) -> tuple[Integers, float]:
     """One fix (N,) of each interval, the one that most others of it agree with, and their length in s."""
     times_s = 1e-9 * (sighted.stamps_ns - sighted.stamps_ns[0])
@@ -327,7 +322,7 @@ def _apart(sighted: _Sighted, T_enu_world: Pose) -> tuple[Integers, float]:
 
 def _tied(graph: PoseGraph, keyframes: Integers, sighted: _Sighted, T_enu_world: Pose, up: Vector) -> PoseGraph:
     """A graph of the edges in force of another one, not robust here, and of robust positions by fixes."""
-    tied, kept = PoseGraph(graph.dimension), ~graph.is_rejected
+    tied, kept = PoseGraph(graph.dimension), ~(graph.is_rejected | graph.is_of_origin)
     for T, stamp_ns in zip(graph.poses, graph.stamps_ns.tolist(), strict=True):
         tied.add_pose(T, stamp_ns)
     edges = graph.edges[kept], graph.measurements[kept], graph.information[kept]
@@ -344,7 +339,7 @@ def _constrain(
     d, R = graph.dimension, T_enu_world[:3, :3]
     information, R_up_lidar = (
         np.eye(graph.freedom) * _FREE_M**-2.0,
-        _upright(up) @ lie.lift(graph.poses[0])[:3, :3],
+        upright(up) @ lie.lift(graph.poses[0])[:3, :3],
     )
     of_rotation = R_up_lidar.T @ np.diag(np.array([_TILT_RAD, _TILT_RAD, _FREE_RAD]) ** -2.0) @ R_up_lidar
     information[d:, d:] = of_rotation if d == 3 else _FREE_RAD**-2.0

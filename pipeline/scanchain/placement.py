@@ -235,7 +235,7 @@ class Placement:
 
         targets, sources = self.graph.edges.T
         is_between = (targets < segment.start) & (sources >= segment.start) & (sources < segment.stop)
-        self.graph.remove_loops(self.graph.is_loop & is_between)
+        self.graph.remove_edges(self.graph.is_loop & is_between)
         self.closures.reject(is_meant, problem)
         return is_meant
 

@@ -24,6 +24,7 @@ from scanchain.data import (
     Points,
     Pose,
     RaySpan,
+    RestForce,
     Scan,
     Step,
     Timing,
@@ -34,6 +35,7 @@ from scanchain.errors import InputError, counted
 from scanchain.georeference import Georeference, Georeferencing
 from scanchain.graph.factors import Odometry
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.gravity import leveled
 from scanchain.growing_array import GrowingArray
 from scanchain.loops import ClosureTable, refined, spread
 from scanchain.maps import SavedMap
@@ -134,6 +136,7 @@ class Slam:
         self.spans = GrowingArray((2,), np.int64)  # rows of the points of each scan, if all are kept
         self.traveled_m = self.back_end.start_m
         self.fixes: list[Fixes] = []
+        self.at_rest: dict[int, RestForce] = {}  # by keyframe
 
     def __repr__(self) -> str:
         scans = counted(len(self.steps), f"{self.dimension}D scan")
@@ -205,7 +208,15 @@ class Slam:
         starts = [start - first for start in back_end.closer.segments.starts]
         corrected = spread(state.poses[first:], scan_of, odometry.poses, starts)
         components, graph = back_end.closer.segments.components(back_end.graph), back_end.graph
-        located = Georeferencing(self.fixes, self.T_base_lidar, self.config.graph) if self.fixes else None
+        up, by_gravity = lie.lift(self.T_base_lidar)[2, :3], ""
+        if self.at_rest and not first:
+            graph, by_gravity = leveled(graph, self.at_rest, self.config.graph)
+            state, up = graph.state(), np.array([0.0, 0.0, 1.0])
+            corrected = spread(state.poses, scan_of, odometry.poses, starts)
+            odometry = Trajectory(
+                odometry.stamps_ns, corrected[0] @ lie.between(odometry.poses[0], odometry.poses)
+            )
+        located = Georeferencing(self.fixes, up, self.config.graph) if self.fixes else None
         if located is not None:
             progress("comparing with the fixes of the GNSS receiver")
             found = located.constrained(Trajectory(odometry.stamps_ns, corrected), graph, scan_of)
@@ -218,7 +229,7 @@ class Slam:
             world = (fixed, state.poses[:first]) if fixed else (self.keyframes, poses)
             corrected = refined(corrected, self._points_of, *world, self.config)
         tracking, placement = self.front_end.odometry, back_end.placement
-        trajectory, notes = Trajectory(odometry.stamps_ns, corrected), tracking.predictor.notes()
+        trajectory, notes = Trajectory(odometry.stamps_ns, corrected), (*tracking.predictor.notes(), by_gravity)
         georeference = located and located.place(trajectory)
         if located is not None:
             notes = (*notes, f"GNSS: {located.note}")
@@ -234,7 +245,7 @@ class Slam:
             config=self.config,
             steps=self.steps,
             warnings=tracking.predictor.warnings(),
-            sensor_notes=notes,
+            sensor_notes=tuple(filter(None, notes)),
             T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,
@@ -274,6 +285,8 @@ class Slam:
             scale=located.scale,
             noise_m=located.noise_m,
         )
+        if located.at_rest is not None:
+            self.at_rest[keyframe.index] = located.at_rest
         motion: list[Constraint] = []
         if number:
             Z = lie.between(self.keyframes[-1].T_odom_lidar, keyframe.T_odom_lidar)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import scanchain
+from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.georeference import Georeferencing
 from scanchain.loops import spread
@@ -60,7 +61,7 @@ def row_of(world: str, sensor: str, gnss: str, result: Any, seeds: int) -> list[
     truth = drive.truth()
     for seed in range(seeds):
         fixes, is_wrong = fixes_along(replace(drive, seed=seed))
-        placing = Georeferencing([fixes], drive.T_base_lidar, result.config.graph)
+        placing = Georeferencing([fixes], lie.lift(drive.T_base_lidar)[2, :3], result.config.graph)
         trajectory, graph = result.trajectory, placing.constrained(result.trajectory, result.graph, keyframes)
         if graph is not None:
             poses = spread(graph.poses, keyframes, result.odometry.poses)

@@ -114,7 +114,7 @@ def test_a_position_of_one_pose_is_neither_odometry_nor_loop_and_enters_chi2_and
     assert np.isfinite(drift.between(graph, 0, 10.0)).all()
     segments.start(4)
     assert segments.components(graph).max() == 0  # joined by the loop alone
-    graph.remove_loops(graph.is_loop)
+    graph.remove_edges(graph.is_loop)
     assert segments.components(graph).tolist() == [0] * 4 + [1] * 4
     errors = [KeyframeErrors(1.0, np.zeros((3, 3)), 0.5)] * len(graph)
     judged, own = with_map_errors(graph, errors, config)

@@ -35,11 +35,11 @@ def fixes_along(drive, *, is_antenna_known=True):
     return Fixes(stamps_ns[kept], positions, covariances, known), samples.is_multipath[kept]
 
 
-def driven(truth, yaw_rad_m=0.0):
+def driven(truth, yaw_rad_m=0.0, pitch_rad_m=0.0):
     """Trajectory of a lidar whose odometry turns too far by so much per meter, its graph, scans of keyframes."""
     steps = lie.between(truth.poses[:-1], truth.poses[1:])
     twists = np.zeros((len(steps), 6))
-    twists[:, 5] = yaw_rad_m * np.linalg.norm(steps[:, :3, 3], axis=1)
+    twists[:, 4:] = np.linalg.norm(steps[:, :3, 3], axis=1)[:, None] * [pitch_rad_m, yaw_rad_m]
     poses = [np.eye(4)]
     for step in steps @ lie.exp(twists):
         poses.append(lie.normalize(poses[-1] @ step))

@@ -10,8 +10,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scanchain import lie
-from scanchain.data import Integers, Mask, Matrix, Vector
+from scanchain.data import GraphState, Integers, Mask, Matrix, Vector
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks
+from scanchain.graph.factors import ORIGIN
+from scanchain.graph.losses import rejection_limit
 from scanchain.graph.problem import GraphProblem
 
 _ROUNDING = 1e-9  # avoids a division by zero for edges that alone connect their poses to the graph
@@ -76,6 +78,14 @@ def _distances(e: Matrix, omega: Matrix, P: Matrix, kept: Mask) -> Vector:
     sign = np.where(kept, -1.0, 1.0)[:, None, None]
     matrix = (1.0 + _ROUNDING) * np.eye(e.shape[1]) + sign * (P @ omega)
     return (e[:, None] @ omega @ np.linalg.solve(matrix, e[..., None]))[:, 0, 0]
+
+
+def is_bent(before: GraphState, after: GraphState, robust_scale: float) -> bool:
+    """True if unary edges added since contradict those between poses by more than their standard deviations."""
+    old, new = (each.edge_chi2[each.edges[:, 0] != ORIGIN] for each in (before, after))
+    increase = (new - old)[~before.is_rejected[before.edges[:, 0] != ORIGIN]]
+    k = lie.twist_size(before.poses)
+    return bool(increase.max() > rejection_limit(robust_scale, k) or increase.mean() > k)
 
 
 FEWEST = 3  # least number of edges of a group; fewer may agree by chance

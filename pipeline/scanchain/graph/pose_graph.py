@@ -284,8 +284,8 @@ class PoseGraph:
         for column, new in zip(self._of_edges, rows, strict=True):
             column.extend(new)
 
-    def remove_loops(self, is_removed: Mask) -> None:
-        """Remove loop edges; is_removed (E,) is True for each edge to remove."""
+    def remove_edges(self, is_removed: Mask) -> None:
+        """Remove edges, but none of odometry; is_removed (E,) is True for each edge to remove."""
         self._changed()
         for column in self._of_edges:
             column.replace(column.rows[~is_removed])

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from scanchain.data import LEAST_FIT, Match, Matrix, Pose, Vector
+from scanchain.data import LEAST_FIT, Match, Matrix, Pose, RestForce, Vector
 from scanchain.odometry.gyro import Gyro
 
 GRAVITY_M_S2 = 9.81
@@ -16,7 +17,8 @@ _DETERMINED = 0.5  # least information of a match about the position, as a share
 _UNKNOWN_M_S = 1.0  # σ of the velocity above which it is not used
 _POSITION_M = 0.003  # least σ of a match
 _VELOCITY_M_S, _GRAVITY_M_S2, _BIAS_M_S2 = 40.0, 1.0, 0.05  # σ at first: any car, tilted axes, MEMS
-_TURNED, _WALK = 0.005, 0.001  # random walks of gravity in a drifting odometry frame, and of the bias: m/s² per √s
+_TURNED = 2.0  # σ of the turn of gravity in the drifting odometry frame, in differences of gyro and match
+_WALK = 0.001  # random walk of the bias: m/s² per √s
 _NOISE_RAD = 0.001  # σ of the rotation of a match, by which gravity appears as an acceleration
 _NORM = 0.03  # m/s², σ of the magnitude of gravity
 _MOST = 100.0  # largest factor on a variance
@@ -36,7 +38,7 @@ def _block(*at: tuple[int, int]) -> Matrix:
 
 _ONCE, _TWICE = _block((0, 1), (1, 2)), _block((0, 2))  # of the motion over a time: position, velocity, gravity
 _OF_P, _OF_PV, _OF_V = _block((0, 0)), _block((0, 1), (1, 0)), _block((1, 1))  # of the noise of accelerations
-_WALKS = _TURNED**2 * _block((2, 2)) + _WALK**2 * _block((3, 3))
+_WALKS = _WALK**2 * _block((3, 3))
 
 
 class Accelerometer:
@@ -54,6 +56,7 @@ class Accelerometer:
         self.p_lidar_imu = np.zeros(3)
         self.position = np.zeros(3)  # predicted, of the lidar
         self.covariance = np.zeros((3, 3))  # of it, in the lidar's frame
+        self.R_odom_lidar = np.eye(3)  # predicted by the gyro
         self.innovation = np.zeros(3)
         self.of_prediction = self.of_match = 1.0  # factors on variances
         self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared, in σ²: ours, of the last motion
@@ -69,6 +72,14 @@ class Accelerometer:
     @property
     def _knows_velocity(self) -> bool:
         return float(np.trace(self.P[_V, _V])) < _UNKNOWN_M_S**2
+
+    def at_rest(self, T_odom_lidar: Pose) -> RestForce | None:
+        """What it would measure at rest in this pose; None while it is not used."""
+        if not self.is_used:
+            return None
+        J = np.zeros((3, 12))
+        J[:, _G], J[:, _B] = -T_odom_lidar[:3, :3].T, np.eye(3)
+        return RestForce(J @ self.x, J @ self.P @ J.T, self.x[_B], self.P[_B, _B])
 
     def predict(self, T_odom_last: Pose, gyro: Gyro) -> None:
         """Predict the position at a scan from the pose of the last one and the samples since."""
@@ -89,7 +100,7 @@ class Accelerometer:
         self.x[_P] += left_s @ changes
         self.x[_V] += changes.sum(axis=0)
         self.P = F @ self.P @ F.T + self._noise(lasted_s, forces)
-        R_now = R_odom @ R_last[-1]
+        R_now = self.R_odom_lidar = R_odom @ R_last[-1]
         self.position = self.x[_P] - R_now @ self.p_lidar_imu
         self.covariance = _CAUTION * R_now.T @ self.P[_P, _P] @ R_now
 
@@ -117,6 +128,8 @@ class Accelerometer:
         if square > _OUTLIER:
             C += np.outer(innovation, innovation)
         self._update(np.eye(3, 12), innovation, C)
+        turned = _TURNED * np.cross(Rotation.from_matrix(R @ self.R_odom_lidar.T).as_rotvec(), self.x[_G])
+        self.P[_G, _G] += np.outer(turned, turned)
         size, along = float(np.linalg.norm(self.x[_G])), np.zeros((1, 12))
         along[0, _G] = self.x[_G] / size
         self._update(along, np.array([GRAVITY_M_S2 - size]), np.full((1, 1), _NORM**2))

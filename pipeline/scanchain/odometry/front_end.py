@@ -7,7 +7,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, Scan, State
+from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, RestForce, Scan, State
 from scanchain.graph.factors import edge_information
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.odometry.odometry import Odometry, Tracked
@@ -26,7 +26,8 @@ class Located(msgspec.Struct, frozen=True):
     ``is_keyframe``;
     ``errors`` are those of the pose of the last keyframe, this scan included, against the map;
     ``first_points`` (M, d) are those of the first scan, deskewed once the second one gives its velocity;
-    ``noise_m`` is the standard deviation of the ranges where it is above the one configured, else 0.
+    ``noise_m`` is the standard deviation of the ranges where it is above the one configured, else 0;
+    ``at_rest`` is the force of gravity by an accelerometer, None without, and unless ``is_keyframe``.
     """
 
     tracked: Tracked
@@ -37,6 +38,7 @@ class Located(msgspec.Struct, frozen=True):
     errors: KeyframeErrors
     first_points: Points
     noise_m: float = 0.0
+    at_rest: RestForce | None = None
 
 
 class FrontEnd:
@@ -86,6 +88,7 @@ class FrontEnd:
             errors=self.errors,
             first_points=self.odometry.first_points,
             noise_m=self.odometry.noise_m,
+            at_rest=self.odometry.predictor.at_rest(tracked.T_odom_lidar) if is_keyframe else None,
         )
 
     def _of_edge(self, tracked: Tracked) -> Matrix:

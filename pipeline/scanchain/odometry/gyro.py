@@ -87,6 +87,14 @@ class Gyro:
         return bool(ours < others)
 
     @property
+    def is_mounted(self) -> bool:
+        """True if its axes are those that the log's transforms state."""
+        if self.stated is None or self.model is None:
+            return False
+        scale = float(np.sum(self.model.axes * self.stated)) / self.size
+        return bool(np.allclose(self.model.axes, scale * self.stated))
+
+    @property
     def sigma_rad(self) -> float:
         """Standard deviation of ``rotation``, in each component."""
         return _SIGMA_RAD + _SIGMA * float(np.linalg.norm(self.rotation))

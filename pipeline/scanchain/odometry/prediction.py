@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import OdometryConfig
-from scanchain.data import LEAST_FIT, Match, Matrix, Pose, Prior, Scan, State
+from scanchain.data import LEAST_FIT, Match, Matrix, Pose, Prior, RestForce, Scan, State
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
@@ -268,6 +268,10 @@ class Predictor:
         covariance = sigma_rad**2 * np.eye(6)
         covariance[:3, :3] = self.accelerometer.covariance
         return motion, covariance
+
+    def at_rest(self, T_odom_lidar: Pose) -> RestForce | None:
+        """What the accelerometer would measure at rest; None where unused or of unknown mounting."""
+        return self.accelerometer.at_rest(T_odom_lidar) if self.gyro.is_mounted else None
 
     @property
     def doubts_scans(self) -> bool:
