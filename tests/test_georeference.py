@@ -47,6 +47,8 @@ def test_with_multipath_in_half_of_the_fixes_it_is_within_a_meter_and_these_are_
     assert away_m(place, trajectory, drive.truth()) < 0.05
     of_place = is_wrong[np.isin(fixes.stamps_ns, place.stamps_ns)]
     assert place.is_rejected[of_place].mean() > 0.95 and place.is_rejected[~of_place].mean() < 0.05
+    assert 0.2 < np.sqrt(np.mean(place.innovations[~place.is_rejected] ** 2)) < 1.3
+    assert place.innovations[place.is_rejected].min() > place.innovations[~place.is_rejected].max()
     assert after_m == before_m and not place.origin.is_constrained
 
 

@@ -8,7 +8,7 @@ coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist h
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, NamedTuple, Protocol
@@ -582,6 +582,8 @@ class Step:
     graph : the optimized graph if this scan led to an optimization, else None
     timing : seconds by stage
     starts_segment : True if its motion from the scan before is unknown
+    innovations : normalized innovation of each other sensor that was compared with the match: the Mahalanobis
+        distance over the square root of its degrees of freedom, about 1 if the covariances are right
     """
 
     __repr__ = brief
@@ -598,6 +600,7 @@ class Step:
     graph: GraphState | None
     timing: Timing
     starts_segment: bool = False
+    innovations: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,7 @@ class Georeference:
     origin, R_enu_world : of the world frame, whose axes R (3, 3) rotates to east, north and up
     antenna_m : (3,) of the receiver, in the frame of the lidar
     stamps_ns, is_rejected : (M,) of the fixes, and which contradict the trajectory
+    innovations : (M,) normalized, as in ``Step``
     """
 
     __repr__ = brief
@@ -84,6 +85,7 @@ class Georeference:
     antenna_m: Vector
     stamps_ns: Integers
     is_rejected: Mask
+    innovations: Vector
 
     @property
     def geodesy(self) -> Geodesy:
@@ -249,7 +251,7 @@ class Georeferencing:
             len(is_rejected), int(is_rejected.sum()), self.is_constrained,
         )  # fmt: skip
         self.note = "; ".join(filter(None, [origin.text, self.note]))
-        return Georeference(origin, R, datum.antenna_m, sighted.stamps_ns, is_rejected)
+        return Georeference(origin, R, datum.antenna_m, sighted.stamps_ns, is_rejected, np.sqrt(chi2 / d))
 
     def _sighted(self, trajectory: Trajectory) -> _Sighted | None:
         """The fixes between scans of a trajectory; None without any."""

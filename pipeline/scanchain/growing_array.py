@@ -72,6 +72,10 @@ class Columns:
         """View of a column, (n, ...), not to be written to."""
         return self._columns[name].rows if self._columns else np.empty(0)
 
+    def replace(self, name: str, values: NDArray[Any]) -> None:
+        """Replace the values (n, ...) of a column."""
+        self._columns[name].replace(values)
+
     @property
     def texts(self) -> list[str]:
         """Texts by integer code."""

@@ -188,6 +188,7 @@ class Slam:
             graph=state,
             timing=Timing(tracked.scan.waited_s, *seconds, working_s() - started),
             starts_segment=tracked.elsewhere_m > 0.0,
+            innovations=tracked.innovations,
         )
         self.steps.append(step)
         return step
@@ -231,6 +232,8 @@ class Slam:
         tracking, placement = self.front_end.odometry, back_end.placement
         trajectory, notes = Trajectory(odometry.stamps_ns, corrected), (*tracking.predictor.notes(), by_gravity)
         georeference = located and located.place(trajectory)
+        if georeference is not None:
+            self.steps.compare("GNSS", georeference.stamps_ns, georeference.innovations)
         if located is not None:
             notes = (*notes, f"GNSS: {located.note}")
         return SlamResult(

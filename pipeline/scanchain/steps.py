@@ -7,12 +7,13 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Matrix, State, Step, Trajectory
+from scanchain.data import Integers, Matrix, State, Step, Trajectory, Vector
 from scanchain.growing_array import Columns
 
 _SINGULAR = 1e-12  # ratio of smallest to largest eigenvalue below which an information matrix is not inverted
 
 STAGES = ("read", "preprocess", "match", "map", "loops")
+SENSORS = ("wheels", "gyro", "accelerometer", "GNSS")  # that are compared with the matches
 _OF_SCAN = ("index", "stamp_ns", "log_time_ns", "dropped", "is_copy")
 _OF_STEP = ("keyframe", "state", "reason", "starts_segment", "T_odom_lidar", "T_world_lidar")
 _OF_MATCH = (
@@ -41,10 +42,25 @@ class Steps:
             "T_odom_base": unknown if scan.T_odom_base is None else scan.T_odom_base,
             "timing": [getattr(step.timing, f"{stage}_s") for stage in STAGES],
             "cost_m2": match.cost,
+            **{f"innovation_{sensor}": step.innovations.get(sensor, np.nan) for sensor in SENSORS},
             **{name: getattr(scan, name) for name in _OF_SCAN},
             **{name: getattr(step, name) for name in _OF_STEP},
             **{name: getattr(match, name) for name in _OF_MATCH},
         })  # fmt: skip
+
+    def compare(self, sensor: str, stamps_ns: Integers, innovations: Vector) -> None:
+        """Set normalized innovations (M,) of a sensor, each at the scan nearest to its stamp (M,)."""
+        scans_ns = self.columns["stamp_ns"]
+        after = np.clip(np.searchsorted(scans_ns, stamps_ns), 1, len(scans_ns) - 1)
+        values = np.full(len(scans_ns), np.nan)
+        values[after - (2 * stamps_ns < scans_ns[after - 1] + scans_ns[after])] = innovations
+        self.columns.replace(f"innovation_{sensor}", values)
+
+    @property
+    def innovations(self) -> dict[str, Vector]:
+        """(N,) normalized innovations, NaN where not compared, of each sensor that was compared at some scan."""
+        found = {sensor: self.columns[f"innovation_{sensor}"] for sensor in SENSORS}
+        return {sensor: values for sensor, values in found.items() if np.isfinite(values).any()}
 
     @property
     def last_state(self) -> State:

@@ -70,6 +70,7 @@ def test_it_predicts_positions_and_finds_velocity_and_gravity():
     accelerometer, errors = drive(60)
     assert errors[20:].max() < 0.01
     assert accelerometer.is_used
+    assert 0.1 < accelerometer.innovation < 3.0
     gravity = accelerometer.x[6:9]
     assert np.degrees(np.arccos(-gravity @ TILT[:3, :3] @ UP / np.linalg.norm(gravity))) < 0.2
     assert "IMU: its accelerometer predicts the translation of 72 % of the scans, to 0.00" in accelerometer.note()
@@ -78,6 +79,7 @@ def test_it_predicts_positions_and_finds_velocity_and_gravity():
 def test_where_scans_are_lost_it_continues_the_motion_for_seconds():
     accelerometer, errors = drive(80, blind=20)
     assert errors[-20:].max() < 0.15  # of 6 m, and 2 s on a curve
+    assert np.isnan(accelerometer.innovation)
     assert np.trace(accelerometer.covariance) ** 0.5 > errors[-1] / 3.0  # and says how far off it may be
 
 

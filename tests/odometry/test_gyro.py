@@ -89,6 +89,7 @@ def test_its_rotations_are_those_of_the_lidar_and_its_bias_is_found(dimension):
     errors_deg = drive(gyro, dimension=dimension)
     assert gyro.is_used
     assert errors_deg[20:].max() < 0.03
+    assert 0.0 < gyro.innovation < 1.0  # it errs by less than stated
     assert np.degrees(np.abs(gyro.model.bias - BIAS[-gyro.size :])).max() < 0.1
     assert gyro.warnings() == ()
     assert "predicts the rotation of" in gyro.note()
@@ -145,7 +146,8 @@ def test_without_samples_for_long_there_is_no_rotation():
     drive(gyro, scans=12)
     scan = Scan.of(np.ones((2, 3)), 1e9 + 2.0, np.array([0.0, SCAN_S]), index=12)
     assert gyro.predict(scan, sweep_of(scan, PreprocessConfig())) is None
-    assert any("no sample" in line for line in gyro.warnings())
+    gyro.correct(np.eye(4))
+    assert any("no sample" in line for line in gyro.warnings()) and np.isnan(gyro.innovation)
 
 
 def test_a_rotation_by_scans_that_is_far_off_does_not_move_the_bias():
@@ -154,6 +156,8 @@ def test_a_rotation_by_scans_that_is_far_off_does_not_move_the_bias():
     before, gyro.now_s, gyro.next_fit = gyro.model.bias, gyro.now_s + SCAN_S, np.inf
     gyro.correct(lie.exp(np.r_[np.zeros(3), gyro.rotation + np.array([0.0, 0.0, 0.1])]))
     assert gyro.errors[-1][0] > 0.005
+    variance = gyro.sigma_rad**2 + gyro.bias_variance * SCAN_S**2
+    assert gyro.innovation == pytest.approx(0.1 / np.sqrt(3.0 * variance), rel=1e-3) and gyro.innovation > 5.0
     assert np.array_equal(before, gyro.model.bias)
 
 

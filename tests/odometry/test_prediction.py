@@ -135,6 +135,17 @@ def test_wheels_predict_the_motion_that_they_measure_and_a_jump_of_theirs_is_tol
     assert again.source is Source.CONSTANT_VELOCITY and not again.prior.is_measured
 
 
+@pytest.mark.parametrize(("off_m", "least", "most"), [(0.0, 0.0, 0.1), (0.1, 2.0, 100.0)])
+def test_wheels_that_contradict_a_match_have_a_large_innovation(dimension, off_m, least, most):
+    last_s = EVENLY_S[-2]  # that is matched
+    predictor, _ = predicted(
+        dimension, evenly, EVENLY_S, lambda time_s: evenly(time_s) + off_m * (time_s == last_s)
+    )
+    assert least <= predictor.innovations["wheels"] < most
+    predictor, _ = predicted(dimension, evenly, EVENLY_S)
+    assert np.isnan(list(predictor.innovations.values())).all()
+
+
 @pytest.mark.parametrize(
     ("is_kept", "changes", "limit_m"),
     [

@@ -392,3 +392,18 @@ def test_the_verdict_is_recorded_as_text_with_its_segments_as_lines_and_events(t
     document = column(log, entities.VERDICT, "TextDocument:text", is_static=True)[-1]
     assert document[0].startswith("## check these segments\n\notherwise ATE below 1 m\n")
     assert segments[0].text in document[0]
+
+
+def test_innovations_of_other_sensors_have_a_series_each_where_they_were_compared_and_a_view(tmp_path):
+    log, steps = tmp_path / "a.rrd", [replace(each, innovations={"gyro": 0.5}) for each in STEPS[2]]
+    steps[7] = replace(steps[7], innovations={})
+    with opened(log) as recording:
+        recording.log_innovations(table_of(steps))
+        assert recording.has_sensors
+    assert recording.warnings == []
+    (entity,) = [entity for entity in rows_of(log)[0] if entity.startswith(entities.INNOVATIONS)]
+    assert column(log, entity, "scan") == [k for k in range(60) if k != 7]
+    assert column(log, entity, "Scalars:scalars") == [[0.5]] * 59
+    with opened(tmp_path / "b.rrd") as recording:
+        recording.log_innovations(table_of(STEPS[2]))
+        assert not recording.has_sensors

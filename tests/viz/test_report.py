@@ -37,7 +37,7 @@ from scanchain_viz.report.page import (
     verdict_cell,
     write_page,
 )  # fmt: skip
-from scanchain_viz.report.run import map_section, trajectory_lines
+from scanchain_viz.report.run import map_section, sensor_section, trajectory_lines
 from scanchain_viz.report.sections import loop_section
 from tests.support import made
 from tests.support.browser import find_browser, look
@@ -339,6 +339,15 @@ def test_segments_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_f
     flat = map_section(lines, points * [1.0, 1.0, 0.0], positions, 0.2)
     shown = [[drawing.is_still for drawing in each.drawings] for each in (section, flat)]
     assert shown == [[True, False], [True, False]]  # the map is there once
+
+
+def test_innovations_of_other_sensors_are_drawn_where_there_are_any():
+    assert not list(sensor_section(pa.table({"innovation": [1.0]})))
+    values = np.where(np.arange(1000) % 10, np.nan, 2.0)
+    (section,) = sensor_section(pa.table({"innovation_gnss": values, "innovation_gyro": np.ones(1000)}))
+    assert [chip.name for chip in section.chips] == ["gyro", "GNSS"]
+    assert "root mean square of 4" in section.drawings[0].caption
+    assert all(chip.color in section.drawings[0].svg for chip in section.chips)
 
 
 @BOTH

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -57,7 +58,7 @@ class Accelerometer:
         self.position = np.zeros(3)  # predicted, of the lidar
         self.covariance = np.zeros((3, 3))  # of it, in the lidar's frame
         self.R_odom_lidar = np.eye(3)  # predicted by the gyro
-        self.innovation = np.zeros(3)
+        self.last_m, self.innovation = np.zeros(3), math.nan  # innovation of the last match; normalized
         self.of_prediction = self.of_match = 1.0  # factors on variances
         self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared, in σ²: ours, of the last motion
         self.squares, self.compared = np.zeros(2), 0  # sums of all of them in m²
@@ -111,6 +112,7 @@ class Accelerometer:
         """
         self.scans += 1
         self.used += self.is_used
+        self.innovation = math.nan
         if not self.is_tracking or match is None:
             return
         R, information = T_odom_lidar[:3, :3], match.information
@@ -123,8 +125,10 @@ class Accelerometer:
         C *= self.of_match
         weighted = np.linalg.solve(self.P[_P, _P] + C, innovation)
         square = float(innovation @ weighted) / 3.0
-        self._adapt(square, persists=float(self.innovation @ weighted) > 0.0)
-        self.innovation = innovation
+        self._adapt(square, persists=float(self.last_m @ weighted) > 0.0)
+        self.last_m = innovation
+        if self._knows_velocity:
+            self.innovation = math.sqrt(square)
         if square > _OUTLIER:
             C += np.outer(innovation, innovation)
         self._update(np.eye(3, 12), innovation, C)

@@ -72,6 +72,7 @@ class Gyro:
         self.blocks: deque[tuple[Vector, Matrix]] = deque(maxlen=_SCANS)  # times (M,); rates and forces (M, 6)
         self.motions: deque[Motion] = deque(maxlen=_SCANS)
         self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared: of the gyro, of equal motion
+        self.innovation = math.nan  # of the last scan, normalized
         self.count, self.compared, self.next_fit = 0, 0, float(_FIRST_FIT)
         self.scans, self.used = 0, 0
         self.sums = np.zeros(2)  # of all errors of this model
@@ -127,7 +128,7 @@ class Gyro:
 
     def correct(self, T_previous_current: Pose | None) -> None:
         """Compare with the motion between the middles of the last scan and this one, None where it is unknown."""
-        begin_s, self.last_s = self.last_s, self.now_s
+        begin_s, self.last_s, self.innovation = self.last_s, self.now_s, math.nan
         if not self.blocks:
             return
         self.scans += 1
@@ -220,7 +221,9 @@ class Gyro:
         self.sums += self.errors[-1]
         self.compared += 1
         self.bias_variance += _WALK**2 * lasted_s
-        if error @ error < _OUTLIER**2 * (self.sigma_rad**2 + self.bias_variance * lasted_s**2):
+        variance = self.sigma_rad**2 + self.bias_variance * lasted_s**2
+        self.innovation = math.sqrt(error @ error / (self.size * variance))
+        if error @ error < _OUTLIER**2 * variance:
             gain = self.bias_variance / (self.bias_variance + (_SIGMA_RAD / lasted_s) ** 2)
             self.model = self.model._replace(bias=self.model.bias + gain * error / lasted_s)
             self.bias_variance *= 1.0 - gain

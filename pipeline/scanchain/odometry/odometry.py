@@ -40,7 +40,8 @@ class Tracked(msgspec.Struct, frozen=True):
     ``prior`` is that of this pose, its covariance that at the middle of the scan;
     ``elsewhere_m`` is how far away it may be where its motion is unknown, else 0;
     ``is_repeated`` if its points are those of the scan before;
-    ``spans`` are the origins of the rays of ``points``, () where all start at that of the lidar frame.
+    ``spans`` are the origins of the rays of ``points``, () where all start at that of the lidar frame;
+    ``innovations`` as in ``Step``.
     """
 
     __repr__ = brief
@@ -58,6 +59,7 @@ class Tracked(msgspec.Struct, frozen=True):
     elsewhere_m: float = 0.0
     is_repeated: bool = False
     spans: tuple[RaySpan, ...] = ()
+    innovations: dict[str, float] = {}
 
 
 class _Registered(msgspec.Struct, frozen=True):
@@ -144,9 +146,8 @@ class Odometry:
         sample = scan.points[:: len(scan.points) // _SAMPLE + 1].tobytes()
         if self.last is not None and sample == self.last_sample and len(scan.points) >= _FEWEST_COPIED:
             repeated = scan if scan.is_copy else replace(scan, is_copy=True)
-            return _owned(
-                msgspec.structs.replace(self.last, scan=repeated, reason=COPY, is_repeated=True, elsewhere_m=0.0)
-            )
+            changed = {"reason": COPY, "is_repeated": True, "elsewhere_m": 0.0, "innovations": {}}
+            return _owned(msgspec.structs.replace(self.last, scan=repeated, **changed))
         self.last_sample = sample
         self.last = self._placed(prepared)
         return _owned(self.last)
@@ -180,6 +181,7 @@ class Odometry:
             map_s=working_s() - aligned,
             elsewhere_m=registered.elsewhere_m,
             spans=sweep.spans,
+            innovations=self.predictor.innovations,
         )
         tracked = self._at_stamp(tracked, sweep, prediction)
         is_open = tracked.state is not State.OK

@@ -278,6 +278,12 @@ class Predictor:
         """True if most of the last scans were lost or contradicted, or one jumped: they cannot refute wheels."""
         return self.doubtful > _MOST_DOUBTFUL
 
+    @property
+    def innovations(self) -> dict[str, float]:
+        """Normalized innovation of each sensor at the last scan, NaN where it was not compared."""
+        sensors = {"wheels": self.wheels, "gyro": self.gyro, "accelerometer": self.accelerometer}
+        return {name: sensor.innovation for name, sensor in sensors.items()}
+
     def warnings(self) -> tuple[str, ...]:
         """Defects of wheels and IMU, one per line."""
         return self.wheels.warnings() + self.gyro.warnings() + self.accelerometer.warnings()
@@ -289,7 +295,7 @@ class Predictor:
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Update by the pose of a scan: that of its match or, if lost, the predicted one."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
-        before = self.T_previous_current
+        before, self.wheels.innovation = self.T_previous_current, math.nan
         self.lost_s = self.lost_s + prediction.interval_s if state is State.LOST else 0.0
         if self.intervals.last_scan is not None:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
@@ -326,7 +332,11 @@ class Predictor:
                 self.filter.correct(innovation, match.information, statistics.covariance)
             is_independent = not is_measured or match.observability >= WEAK
             if state is State.OK and is_independent and not prediction.is_second:
-                statistics.update(innovation, definite_inverse(match.information).diagonal())
+                covariance = definite_inverse(match.information)
+                statistics.update(innovation, covariance.diagonal())
+                if prediction.source is Source.WHEELS:
+                    weighted = np.linalg.solve(prediction.prior.covariance + covariance, innovation)
+                    self.wheels.innovation = math.sqrt(innovation @ weighted / len(innovation))
 
 
 def _shows_rotation(match: Match, state: State) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from scanchain import lie
 from scanchain.config import OdometryConfig
 from scanchain.data import Pose, Scan
@@ -15,6 +17,7 @@ class Wheels:
 
     statistics : of its prediction errors
     is_contradicted : whether the reading at the newest scan is rejected
+    innovation : of the motion to the newest scan, normalized; NaN where it is not compared
     """
 
     def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
@@ -23,7 +26,7 @@ class Wheels:
         self.mounting = MountingEstimator(T_base_lidar, is_stated=is_mounted)
         sigma = lie.by_component(lie.twist_size(T_base_lidar), config.wheel_sigma_m, config.wheel_sigma_rad)
         self.statistics = ErrorStatistics(sigma)
-        self.is_contradicted = False
+        self.is_contradicted, self.innovation = False, math.nan
         self._T_odom_base: Pose | None = None  # at the last scan; None where rejected
         self._jumps: list[tuple[int, float]] = []  # scan number and meters of each rejected reading
 

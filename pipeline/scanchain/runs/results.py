@@ -233,6 +233,7 @@ def record_results(recording: Recorder, results: Results) -> None:
     """Send optimized trajectory, final verdicts, cloud and, in 2D, the occupancy grid to the recording."""
     trajectory, grid = results.result.trajectory, results.grid
     recording.log_trajectory(trajectory)
+    recording.log_innovations(results.result.steps)
     recording.log_closures(results.final, results.result.state)
     recording.log_map(results.cloud.points)
     if trajectory.dimension == 2:

@@ -41,6 +41,10 @@ def steps_table(steps: Steps, trajectory: Trajectory, T_base_lidar: Pose | None 
         "degeneracy_eigenvalue": known["degeneracy_eigenvalue"],
         "observability": known["observability"],
         "degeneracy_direction": _lists(known["degeneracy_direction"]),
+        **{
+            f"innovation_{name.lower()}": pa.array(each, from_pandas=True)
+            for name, each in steps.innovations.items()
+        },
         "state": pa.array(steps.texts("state"), pa.string()).dictionary_encode(),
         "reason": pa.array(steps.texts("reason"), pa.string()).dictionary_encode(),
         "starts_segment": known["starts_segment"],

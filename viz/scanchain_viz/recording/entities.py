@@ -45,6 +45,7 @@ RESIDUAL = "plots/residual"
 OBSERVABILITY = "plots/observability"
 ITERATIONS = "plots/iterations"
 LOOPS = "plots/loops"
+INNOVATIONS = "plots/innovations"
 STATE = "state"
 EVENTS = "events"
 LEGEND = "legend"
@@ -86,6 +87,9 @@ _LEGEND = f"""
 **Observability** is the information along the least constrained direction over the minimum required: below 1
 (log10 below 0) a scan is degenerate.
 
+**Other sensors**: normalized innovations of their measurements against the scans, 1 on average if the covariances
+are right; known at the end of the run.
+
 **Timelines**: `scan` counts the scans in the order of the log, `sensor_time` is the header stamp, which may step
 back.
 """
@@ -126,11 +130,14 @@ def constants(dimension: int) -> list[Message]:
     ]
 
 
-def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.Blueprint:
+def blueprint(
+    dimension: int, box: Floats | None = None, scans: int = 0, *, has_sensors: bool = False
+) -> rrb.Blueprint:
     """The layout of a 2D log (seen from above) or a 3D one.
 
     box : (2, 3) lowest and highest coordinates that the view should frame
     scans : their number, 0 if unknown; they are played in half a minute, but no slower than 30 Hz
+    has_sensors : whether there are innovations of other sensors
     """
     hidden, whole = rrb.PlotLegend(visible=False), whole_log()
     observability, residual, *others = (
@@ -142,6 +149,7 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
         rrb.TextDocumentView(origin=LEGEND, name="legend"),
         rrb.TextLogView(origin=EVENTS, name="events"),
         *others,
+        *([rrb.TimeSeriesView(origin=INNOVATIONS, name="other sensors", axis_x=whole)] if has_sensors else ()),
         rrb.TimeSeriesView(origin=TIME, name="time", axis_x=whole, axis_y=ordinary_ms),
     )
     left = rrb.PlotLegend(rrb.Corner2D.LeftTop)  # there are few closures at first

@@ -22,9 +22,9 @@ from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Step, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.runs.job import SinkName
-from scanchain.steps import Steps
+from scanchain.steps import SENSORS, Steps
 from scanchain.verdict import Judged, Kind
-from scanchain_viz.colors import color_of_kind, rgb
+from scanchain_viz.colors import color_of, color_of_kind, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.drawing import Message, Times
@@ -60,6 +60,7 @@ class Recording:
         self.server: subprocess.Popen[bytes] | None = None
         self.batcher = Batcher(self.config)
         self.problems: list[str] = []
+        self.has_sensors = False  # other than lidars
 
     def __enter__(self) -> Recording:
         recording_id = uuid4()
@@ -77,7 +78,8 @@ class Recording:
     def __exit__(self, *error: object) -> None:
         """Write the last batch, frame the view, and close file and viewer."""
         self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.batcher.now)])
-        layout = entities.blueprint(self.dimension, self.batcher.box, int(self.batcher.now.scans[0]))
+        scans = int(self.batcher.now.scans[0])
+        layout = entities.blueprint(self.dimension, self.batcher.box, scans, has_sensors=self.has_sensors)
         for sink in self.opened:
             sink.send(partial(send_layout, blueprint=layout, is_active=True))
             sink.close()
@@ -123,6 +125,11 @@ class Recording:
             _path(entities.OPTIMIZED, optimized.poses, entities.CYAN),
             Message(entities.OPTIMIZED_LIDAR, drawing.transforms(optimized.poses), times),
         ])  # fmt: skip
+
+    def log_innovations(self, steps: Steps) -> None:
+        """Record the normalized innovations of the other sensors."""
+        self.has_sensors = bool(steps.innovations)
+        self._send(lambda: _innovations(steps))
 
     def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
@@ -207,6 +214,15 @@ class Recording:
 def _path(entity: str, poses: Matrix, color: drawing.Color) -> Message:
     """A line through poses (N, d+1, d+1)."""
     return Message(entity, drawing.lines([drawing.positions(poses)], color, 0.75))
+
+
+def _innovations(steps: Steps) -> Iterator[Message]:
+    """A series for each sensor, in the colors of the report, at the scans where it was compared."""
+    times = Times(steps.columns["index"], steps.columns["stamp_ns"])
+    for sensor, values in steps.innovations.items():
+        entity, known = f"{entities.INNOVATIONS}/{sensor}", np.isfinite(values)
+        yield Message(entity, rr.SeriesLines(names=[sensor], colors=[rgb(color_of(SENSORS.index(sensor)))]))
+        yield Message(entity, rr.Scalars.columns(scalars=values[known]), times[known])
 
 
 def _grid(cells: NDArray[np.int8], resolution_m: float, origin_m: tuple[float, float]) -> rr.GridMap:

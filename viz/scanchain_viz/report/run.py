@@ -19,7 +19,7 @@ from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
 from scanchain.runs.metrics import REASON, VERDICT, GroundTruth, Metrics, accuracy_lines, lines_of
 from scanchain.runs.provenance import Provenance
 from scanchain.settings import read_layer
-from scanchain.steps import STAGES
+from scanchain.steps import SENSORS, STAGES
 from scanchain.trajectory import read_tum
 from scanchain.verdict import CHECKS, Kind, Segment
 from scanchain_viz.colors import CLOSURES, OPTIMIZED, SEGMENT_COLORS, TRUTH, color_of
@@ -88,6 +88,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     box, grain_m = frame([optimized], true_path), float(str(config["maps.voxel_size_m"]))
     yield map_section(lines, read_ply(directory / "map.ply"), box, grain_m)
     yield verdict_section(metrics, steps)
+    yield from sensor_section(steps)
     if config["loops.enabled"]:
         yield from sections.loop_section(optimized, closures, "Loop closures")
     is_planar, text = metrics.dimension == 2, ""
@@ -176,6 +177,28 @@ def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
     text = f"Normalized innovations over their limits{largest}; above 1 (dotted): a finding, or wheel slip."
     grid = _segments(metrics.segments) if metrics.segments else None
     return page.Section("Checks", "", chips, [page.Drawing.of("Innovations", text, figure)], grid)
+
+
+def sensor_section(steps: pa.Table) -> Iterator[page.Section]:
+    """Normalized innovations of the other sensors along the log; none without any."""
+    figure, chips, sizes = Plot("scan", "normalized innovation", logarithmic="y", is_wide=True), [], []
+    for place, sensor in enumerate(SENSORS):
+        if (name := f"innovation_{sensor.lower()}") in steps.column_names:
+            values = column_of(steps, name)
+            scans = np.flatnonzero(np.isfinite(values))
+            sizes.append(sections.window(len(scans)))
+            line = sections.windowed(values[scans], _root_mean_square, scans.astype(np.float64))
+            figure.line(np.clip(line, [0.0, sections.CLIPPED[0]], None), color_of(place), 0.9)
+            chips.append(page.Chip(sensor, color_of(place)))
+    if chips:
+        figure.level(1.0)
+        size = f", root mean square of {max(sizes)} neighboring ones" if max(sizes) > 1 else ""
+        text = f"Normalized innovations{size}: 1 (dotted) on average if the covariances are right."
+        yield page.Section("Other sensors", "", chips, [page.Drawing.of("Against the scans", text, figure)])
+
+
+def _root_mean_square(values: Floats, axis: int) -> Floats:
+    return np.sqrt(np.mean(np.square(values), axis=axis))
 
 
 def _segments(segments: Sequence[Segment]) -> page.Grid:
