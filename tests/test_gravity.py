@@ -8,9 +8,8 @@ import pytest
 import scanchain
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.data import RestForce
+from scanchain.data import GRAVITY_M_S2, RestForce
 from scanchain.gravity import leveled
-from scanchain.odometry.accelerometer import GRAVITY_M_S2
 from tests.support import made
 from tests.support.fixes import drive_of, driven
 

@@ -31,6 +31,8 @@ Mask = NDArray[np.bool_]
 _set = object.__setattr__  # sets a field of a frozen record that checks itself
 _SHOWN = 60  # longest text of a value in the ``repr`` of a record
 
+GRAVITY_M_S2, _UNIT = 9.81, 1.3  # and largest ratio of it and the specific force at rest
+BRIDGED_S = 0.15  # longest time between two samples of an IMU in use
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
 MOST_COPIES = 5  # largest number of identical scans in a row that a driver that publishes too often produces
 
@@ -85,6 +87,12 @@ class RaySpan(NamedTuple):
         ends = np.searchsorted(chosen, np.cumsum([span.rays for span in spans]))
         rays = np.diff(ends, prepend=0).tolist()
         return tuple(RaySpan(span.origin, count) for span, count in zip(spans, rays, strict=True))
+
+
+def unit_of(force: float) -> float:
+    """Unit in m/s² of accelerations of this size at rest: 1, or 9.81 if they are in g; 0 if gravity is missing."""
+    units = (unit for unit in (1.0, GRAVITY_M_S2) if 1.0 / _UNIT < force * unit / GRAVITY_M_S2 < _UNIT)
+    return next(units, 0.0)
 
 
 class Inertial(NamedTuple):

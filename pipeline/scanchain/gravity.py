@@ -11,11 +11,10 @@ from scipy.special import gammaincinv
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.data import Integers, Matrix, RestForce, Vector
+from scanchain.data import GRAVITY_M_S2, Integers, Matrix, RestForce, Vector
 from scanchain.graph.consistency import is_bent
 from scanchain.graph.factors import Prior
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.odometry.accelerometer import GRAVITY_M_S2
 
 _CORRELATED_S, _LEAST_S = 1.0, 0.01  # time constant of the errors, and least time between keyframes
 _SURE = 0.999  # probability that errors as stated pass the test

@@ -90,7 +90,7 @@ def test_offsets_change_elevations_and_ranges_of_the_points_as_they_are_read(log
 def test_a_stated_pose_replaces_the_transforms_and_a_wrong_one_is_refused(log):
     opened = scanchain.open_log(log, lidar_pose="1 2 3 0 0 0 1", imu_rotation="0 0 0.7071068 0.7071068")
     np.testing.assert_array_equal(opened.T_base_lidar[:3, 3], [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(opened.imu.T_lidar_imu[:3, 0], [0.0, 1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(opened.imu.T_lidar_sensor[:3, 0], [0.0, 1.0, 0.0], atol=1e-6)
     for text in ("1 2 3", "a b c d e f g", "0 0 0 0 0 0 0"):
         with pytest.raises(InputError, match=r"log.lidar_pose is .* wanted x y z qx qy qz qw"):
             scanchain.open_log(log, lidar_pose=text)

@@ -10,6 +10,8 @@ from scanchain.config import Config, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.doctor import examine
+from scanchain.logs.writer import LogWriter, pack_fix, pack_imu
+from tests.support import made
 from tests.support.naive_logs import (
     SECOND,
     STAMP_NS,
@@ -250,11 +252,12 @@ def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_
     flags = ["--log.odometry_topic", "/odom"]
     assert main(["info", str(path), *flags]) == 0
     text = capfd.readouterr().out
+    unplaced = "without a transform, which is estimated"
     lines = [
-        "GNSS /fix: its fixes give the place on Earth, and correct drift where they show any",
+        f"GNSS /fix: {unplaced}; its fixes give the place on Earth, and correct drift where they show any",
         "poses /gps: not used; --gt /gps uses them as ground truth, --log.odometry_topic /gps as wheels",
         "ground truth /ground_truth: evaluates the result, is not used for it",
-        "IMU /imu/data: predicts motions where it does so better than the scans",
+        f"IMU /imu/data: {unplaced}; predicts motions where it does so better than the scans",
     ]
     assert all(f"sensor    {line}\n" in text for line in lines)
     assert "wheels    /odom" in text and "/odom:" not in text
@@ -340,3 +343,58 @@ def test_scans_of_two_lasers_at_the_same_instants_have_no_gaps_between_these(tmp
             data = laser_scan(STAMP_NS + k * STEP_NS, room(k), step=0.02, frame=frame)
             said.append(scan_said(STAMP_NS + k * STEP_NS + number * 1_000_000, data))
     assert diagnose(saved(tmp_path, said))["gaps"].found == "none longer than 2.5 periods of 0.1 s"
+
+
+def beside(log, folder, topic, messages):
+    """Files of a log, and of one with messages of a sensor: seconds after the first scan, data by stamp."""
+    path, begin_ns = folder / f"{len(list(folder.iterdir()))}.mcap", int(open_log(log).expected_stamps("/scan")[0])
+    with LogWriter(path) as writer:
+        for after_s, pack in messages:
+            stamp_ns = begin_ns + int(1e9 * after_s)
+            type_name = "Imu" if topic == "/imu" else "NavSatFix"
+            writer.append(topic, f"sensor_msgs/msg/{type_name}", pack(stamp_ns), stamp_ns)
+    return log, path
+
+
+def pushed(force, frame="base_link"):
+    return lambda stamp_ns: pack_imu(stamp_ns, frame, np.zeros(3), np.array([0.0, 0.0, force]))
+
+
+@pytest.mark.parametrize(
+    ("force", "frame", "gap_s", "grade", "words"),
+    [
+        (9.81, "base_link", 0.0, "ok", ("100 Hz, at x", "specific force 9.81 m/s²", "a run tests")),
+        (1.0, "base_link", 0.0, "ok", ("specific force 1 g: converted",)),
+        (0.1, "elsewhere", 0.0, "ok", ("without a transform, which is estimated", "0.1 m/s²")),  # the log is 2D
+        (
+            9.81,
+            "base_link",
+            0.5,
+            "warning",
+            ("1 gap of more than 0.15 s, the longest 0.51 s", "predicted without it"),
+        ),
+    ],
+)
+def test_of_an_imu_rate_place_and_gravity_are_told_and_gaps(tmp_path, force, frame, gap_s, grade, words):
+    samples = [(0.01 * k + gap_s * (k > 50), pushed(force, frame)) for k in range(150)]
+    found = diagnose(*beside(made.log("office", seconds=3.0), tmp_path, "/imu", samples))["IMU"]
+    assert found.severity == grade
+    assert all(word in f"{found.found}; {found.effect}" for word in words)
+
+
+def test_of_a_receiver_rate_place_and_stated_errors_are_told_and_one_without_a_fix(tmp_path):
+    log = made.log("office", seconds=3.0)
+    assert {"IMU", "GNSS"}.isdisjoint(diagnose(log))
+    fixes = [
+        (0.2 * k + 0.8 * (k > 5), lambda ns: pack_fix(ns, "a", (49.0, 8.4, 9.0), (3.0, 3.0, 9.0)))
+        for k in range(9)
+    ]
+    found = diagnose(*beside(log, tmp_path, "/fix", fixes))["GNSS"]
+    assert found.severity == "ok"
+    assert found.found == (
+        "/fix: 9 fixes at 5 Hz, up to 1 s apart, without a transform, which is estimated, "
+        "standard deviation 3 m east and north (median)"
+    )
+    none = [(0.2 * k, lambda ns: pack_fix(ns, "a", (49.0, 8.4, 9.0), None)) for k in range(9)]
+    found = diagnose(*beside(log, tmp_path, "/fix", none))["GNSS"]
+    assert (found.severity, found.effect) == ("warning", "it is not used") and "no fixes" in found.found

@@ -48,7 +48,7 @@ def fixes_of(opened):
 def test_the_only_receiver_is_found_with_its_antenna_and_scans_have_each_fix_once(log):
     opened = scanchain.open_log(log)
     assert opened.gnss.topic == "/fix"
-    in_base = lie.transform(opened.mounting.T_base_lidar, opened.gnss.antenna_m[None])[0]
+    in_base = lie.transform(opened.mounting.T_base_lidar, opened.gnss.T_lidar_sensor[None, :3, 3])[0]
     np.testing.assert_allclose(in_base, RECEIVERS["rtk"].antenna_m, atol=1e-9)
     stamps_ns = np.concatenate([each.stamps_ns for each in fixes_of(opened)])
     assert len(stamps_ns) > 190 and (np.diff(stamps_ns) == 100_000_000).all()
@@ -100,9 +100,9 @@ def test_none_leaves_it_unused_of_several_none_is_used_and_another_topic_is_refu
     with pytest.raises(InputError, match=r"log.gnss_topic /odom is not a topic of sensor_msgs/NavSatFix"):
         scanchain.open_log(log, gnss_topic="/odom")
     said = describe([log], load_settings(2).config.log)["sensors"]
-    assert [each.use for each in said if each.sensor == "GNSS"] == [
-        "its fixes give the place on Earth, and correct drift where they show any"
-    ]
+    ((place, use),) = [each.use.split("; ") for each in said if each.sensor == "GNSS"]
+    assert place.startswith("at x ") and place.endswith(" from the lidar")
+    assert use == "its fixes give the place on Earth, and correct drift where they show any"
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import pytest
 
 import scanchain
 from scanchain import lie
+from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.info import describe
 from scanchain.logs.writer import LogWriter, pack_imu
@@ -37,7 +38,7 @@ def test_the_only_imu_is_found_with_its_pose_on_the_lidar(log):
     opened = scanchain.open_log(log)
     assert opened.imu.topic == "/imu/data"
     expected = lie.inverse(opened.mounting.T_base_lidar) @ IMUS["mems"].T_base_imu
-    np.testing.assert_allclose(opened.imu.T_lidar_imu, expected, atol=1e-9)
+    np.testing.assert_allclose(opened.imu.T_lidar_sensor, expected, atol=1e-9)
 
 
 def test_scans_have_all_samples_in_order_each_once_to_their_end(log):
@@ -79,10 +80,10 @@ def test_of_several_none_is_used_until_one_is_chosen(log, tmp_path):
 
 def test_without_a_transform_its_rotation_is_unknown_and_in_the_lidars_own_frame_none_is_needed(log, tmp_path):
     elsewhere = with_more(log, tmp_path, ["/a"], frame="unknown")
-    assert scanchain.open_log(elsewhere, imu_topic="/a").imu.T_lidar_imu is None
+    assert scanchain.open_log(elsewhere, imu_topic="/a").imu.T_lidar_sensor is None
     (tmp_path / "own").mkdir()
     own = with_more(log, tmp_path / "own", ["/a"], frame="lidar")
-    np.testing.assert_array_equal(scanchain.open_log(own, imu_topic="/a").imu.T_lidar_imu, np.eye(4))
+    np.testing.assert_array_equal(scanchain.open_log(own, imu_topic="/a").imu.T_lidar_sensor, np.eye(4))
 
 
 def test_that_of_a_planar_lidar_upside_down_is_as_seen_from_above():
@@ -125,6 +126,8 @@ def test_samples_given_in_python_are_checked(changed, words):
 
 def test_info_says_what_it_is_used_for(log):
     said = describe([log], load_settings(3).config.log)["sensors"]
-    assert [each.use for each in said if each.sensor == "IMU"] == [
-        "predicts motions where it does so better than the scans"
-    ]
+    ((place, use),) = [each.use.split("; ") for each in said if each.sensor == "IMU"]
+    assert place.startswith("at x -0.090 m") and place.endswith("from the lidar")
+    assert use == "predicts motions where it does so better than the scans"
+    said = describe([log], LogConfig(imu_topic="none"))["sensors"]
+    assert "not used; choose it with --log.imu_topic /imu/data" in [each.use for each in said]

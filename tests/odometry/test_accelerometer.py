@@ -6,8 +6,8 @@ import pytest
 import scanchain
 from scanchain import lie
 from scanchain.config import PreprocessConfig
-from scanchain.data import Inertial, Scan
-from scanchain.odometry.accelerometer import GRAVITY_M_S2, Accelerometer
+from scanchain.data import GRAVITY_M_S2, Inertial, Scan
+from scanchain.odometry.accelerometer import Accelerometer
 from scanchain.odometry.gyro import Gyro
 from scanchain.odometry.odometry import first_match
 from scanchain.preprocess import sweep_of

@@ -15,13 +15,14 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain.config import Config, LogConfig, PreprocessConfig
-from scanchain.data import MOST_COPIES, Scan
+from scanchain.data import BRIDGED_S, MOST_COPIES, Fixes, Scan, unit_of
 from scanchain.errors import counted
 from scanchain.files import Source
 from scanchain.logs.bad_scans import most_bad_scans
 from scanchain.logs.log import Log, open_log
 from scanchain.logs.messages.point_times import UNITS_S
 from scanchain.logs.messages.readers import is_scan
+from scanchain.logs.mounting import Sensor
 from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
@@ -120,6 +121,8 @@ class Survey:
         self.log, self.noise = log, RangeNoise()
         self.scans, self.log_times_ns, self.stamps_ns = list[Facts](), list[int](), list[int]()
         self.wheels: list[tuple[int, NDArray[np.float64]]] = []
+        self.inertial: list[tuple[NDArray[np.int64], float]] = []  # stamps, and size of the mean specific force
+        self.fixes: list[Fixes] = []
 
     def add(self, scan: Scan) -> None:
         """Add the next scan."""
@@ -128,6 +131,10 @@ class Survey:
         self.noise = self.noise.measured(scan.points)
         if scan.T_odom_base is not None:
             self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
+        if (found := scan.inertial) is not None:
+            self.inertial.append((found.stamps_ns, float(np.linalg.norm(found.accelerations.mean(axis=0)))))
+        if scan.fixes is not None:
+            self.fixes.append(scan.fixes)
         ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
         at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M))
         percentiles_m = ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)]
@@ -159,6 +166,10 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
     yield _stamps(seen)
     yield _wheels(seen)
+    if seen.log.imu is not None:
+        yield _imu(seen, seen.log.imu)
+    if seen.log.gnss is not None:
+        yield _gnss(seen, seen.log.gnss)
     if seen.log.others:
         found, grade = "; ".join(seen.log.together.absences()), Severity.WARNING
         usual = Finding("lidars", Severity.OK, f"{seen.log.topics} are used together")
@@ -237,6 +248,47 @@ def _wheel_speed_m_s(seen: Survey) -> float:
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     moving = steps_m > _LEAST_STEP_M
     return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
+
+
+def _imu(seen: Survey, imu: Sensor) -> Finding:
+    """Finding on the IMU: its samples, and whether they hold gravity, which a 3D run uses."""
+    stamps_ns = np.concatenate([each for each, _ in seen.inertial] or [[]])
+    if len(stamps_ns) < 2:
+        return Finding(
+            "IMU", Severity.WARNING, f"{imu.topic}: no samples of the time of the scans", "it is not used"
+        )
+    steps_s, force = 1e-9 * np.diff(stamps_ns), float(np.median([force for _, force in seen.inertial]))
+    unit_m_s2 = unit_of(force)
+    found = f"{imu.topic}: {_rate(stamps_ns, 'sample')}, {imu.place}, specific force {force:.3g}"
+    found += " g: converted" if unit_m_s2 > 1.0 else " m/s²"
+    grade, effect = Severity.OK, "used where it predicts motions better than the scans, which a run tests"
+    if not unit_m_s2 and seen.log.dimension == 3:
+        grade, effect = Severity.WARNING, "without gravity only its gyro can be used: choose its raw topic"
+    if gaps := int(np.count_nonzero(steps_s > BRIDGED_S)):
+        found += f"; {counted(gaps, 'gap')} of more than {BRIDGED_S:g} s, the longest {steps_s.max():.2g} s"
+        grade, effect = Severity.WARNING, "the motion over a gap is predicted without it"
+    return Finding("IMU", grade, found, effect)
+
+
+def _gnss(seen: Survey, gnss: Sensor) -> Finding:
+    """Finding on the GNSS receiver: its fixes, and the errors that it states."""
+    stamps_ns = np.concatenate([each.stamps_ns for each in seen.fixes] or [[]])
+    if len(stamps_ns) < 2:
+        return Finding(
+            "GNSS", Severity.WARNING, f"{gnss.topic}: no fixes of the time of the scans", "it is not used"
+        )
+    variances = np.concatenate([each.covariances for each in seen.fixes])[:, [0, 1], [0, 1]]
+    stated = f"standard deviation {np.sqrt(np.median(variances)):.2g} m east and north (median)"
+    longest_s = 1e-9 * float(np.diff(stamps_ns).max())
+    found = (
+        f"{gnss.topic}: {_rate(stamps_ns, 'fix', 'fixes')}, up to {longest_s:.2g} s apart, {gnss.place}, {stated}"
+    )
+    return Finding("GNSS", Severity.OK, found, "used where it agrees with the trajectory, which a run tests")
+
+
+def _rate(stamps_ns: NDArray[np.float64], *words: str) -> str:
+    """Number and rate of samples, as text."""
+    return f"{counted(len(stamps_ns), *words)} at {1e9 / max(float(np.median(np.diff(stamps_ns))), 1.0):.3g} Hz"
 
 
 def _point_times(seen: Survey) -> Finding:

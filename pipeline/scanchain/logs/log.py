@@ -182,6 +182,11 @@ class Log:
         return other
 
     @property
+    def placed(self) -> dict[str, str]:
+        """Topics of the IMU and the GNSS receiver in use, and where they are in the frame of the lidar."""
+        return {each.topic: each.place for each in (self.imu, self.gnss) if each is not None}
+
+    @property
     def damage(self) -> list[str]:
         """Damage found so far; complete once ``scans`` is exhausted or closed."""
         return grouped(self._damage)

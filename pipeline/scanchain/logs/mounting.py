@@ -10,7 +10,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import NO_TOPIC, LogConfig
-from scanchain.data import Pose, Vector
+from scanchain.data import Pose
 from scanchain.errors import InputError, shown
 from scanchain.logs.index import Channel, FileIndex, name_of
 from scanchain.logs.messages.gnss import Fix
@@ -118,28 +118,26 @@ def find_wheels(
     return Wheels(channel, f"{channel.topic}: {names}, {rate_hz:.3g} Hz", found[0])
 
 
-class Imu(NamedTuple):
-    """An IMU: topic, reader of its messages, and pose (4, 4); None where the log does not state it."""
+class Sensor(NamedTuple):
+    """An IMU or a GNSS receiver: topic, reader of its messages, and pose (4, 4) in the frame of the lidar.
 
-    topic: str
-    read: Read
-    T_lidar_imu: Pose | None
-
-
-class Gnss(NamedTuple):
-    """A GNSS receiver: topic, reader of its messages, and position (3,) of the antenna in the frame of the lidar.
-
-    The position is None where the log does not state it.
+    The pose is None where the log does not state it; of a receiver it is that of the antenna.
     """
 
     topic: str
     read: Read
-    antenna_m: Vector | None
+    T_lidar_sensor: Pose | None
+
+    @property
+    def place(self) -> str:
+        """Where it is, as text."""
+        T = self.T_lidar_sensor
+        return f"at {place_text(T)} from the lidar" if T is not None else "without a transform, which is estimated"
 
 
 def find_sensors(
     indexes: Sequence[FileIndex], config: LogConfig, frame: str, span: Span, notes: list[str]
-) -> tuple[Imu | None, Gnss | None]:
+) -> tuple[Sensor | None, Sensor | None]:
     """IMU and GNSS receiver of the configured topics, else the only ones.
 
     Each is None for ``NO_TOPIC``, and if there are several.
@@ -152,8 +150,7 @@ def find_sensors(
     for T_rotation in stated_poses(config.imu_rotation, "log.imu_rotation"):
         T_imu = np.eye(4) if T_imu is None else T_imu.copy()
         T_imu[:3, :3] = T_rotation[:3, :3]
-    antenna_m = None if T_gnss is None else T_gnss[:3, 3]
-    return imu and Imu(imu.topic, reader(imu), T_imu), gnss and Gnss(gnss.topic, reader(gnss), antenna_m)
+    return imu and Sensor(imu.topic, reader(imu), T_imu), gnss and Sensor(gnss.topic, reader(gnss), T_gnss)
 
 
 _SENSORS = {"imu": ("IMU", "sensor_msgs/Imu"), "gnss": ("GNSS receiver", "sensor_msgs/NavSatFix")}  # name and type

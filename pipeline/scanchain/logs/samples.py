@@ -17,7 +17,7 @@ from scanchain.logs.messages.inertial import ImuSample
 from scanchain.logs.messages.point_times import Returns
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.ros import MalformedMessageError
-from scanchain.logs.mounting import Gnss, Imu
+from scanchain.logs.mounting import Sensor
 
 _RETAINED = 4096  # samples in memory: of 2 s and more at 2000 Hz
 NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and that a scan waits for it
@@ -113,8 +113,8 @@ class Recorded:
         self,
         odometry_topic: str,
         ground_truth_topic: str,
-        imu: Imu | None = None,
-        gnss: Gnss | None = None,
+        imu: Sensor | None = None,
+        gnss: Sensor | None = None,
         *,
         is_mirrored: bool = False,
         delays_s: tuple[float, float] = (0.0, 0.0),
@@ -126,13 +126,11 @@ class Recorded:
         topics = odometry_topic, "" if imu is None else imu.topic
         self._delays_ns = {topic: round(1e9 * delay_s) for topic, delay_s in zip(topics, delays_s, strict=True)}
         self.odometry, self.imu = SampleStream[StampedPose](), SampleStream[ImuSample]()
-        self.T_lidar_imu = None if imu is None else imu.T_lidar_imu
-        if self.T_lidar_imu is not None and is_mirrored:
-            self.T_lidar_imu = np.diag([1.0, -1.0, -1.0, 1.0]) @ self.T_lidar_imu
+        upright = np.diag([1.0, -1.0, -1.0, 1.0]) if is_mirrored else np.eye(4)
+        stated = (None if each is None else each.T_lidar_sensor for each in (imu, gnss))
+        self.T_lidar_imu, T_lidar_gnss = (None if T is None else upright @ T for T in stated)
+        self.antenna_m = None if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
         self._fixes = list[Fix]()  # those since the last scan
-        self.antenna_m = None if gnss is None else gnss.antenna_m
-        if self.antenna_m is not None and is_mirrored:
-            self.antenna_m = self.antenna_m * (1.0, -1.0, -1.0)
         self._given_ns = 0  # stamp of the last sample that a scan has
         named = {odometry_topic: self.odometry, "" if imu is None else imu.topic: self.imu}
         self.streams: dict[str, SampleStream[Any]] = {topic: stream for topic, stream in named.items() if topic}

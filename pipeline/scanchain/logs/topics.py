@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from scanchain.config import NO_TOPIC, LogConfig
@@ -12,9 +12,11 @@ from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is
 
 _MOST_LISTED = 8  # largest number of topics in an error
 _USUAL_TRUTH = LogConfig().ground_truth_topic
-_GNSS = (
-    "sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"
-)  # fmt: skip
+_USES = {
+    "imu": ("IMU", "predicts motions where it does so better than the scans"),
+    "gnss": ("GNSS", "its fixes give the place on Earth, and correct drift where they show any"),
+}
+_NOT_READ = "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"  # of GNSS
 
 
 def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
@@ -94,20 +96,22 @@ class OtherSensor:
 
 
 def other_sensors(
-    indexes: Sequence[FileIndex], *, wheels: str, truth: str, imu: str, gnss: str
+    indexes: Sequence[FileIndex], *, wheels: str, truth: str, placed: Mapping[str, str]
 ) -> list[OtherSensor]:
-    """Ground truth, IMU, GNSS and other poses of a log; the arguments are the topics that are used."""
+    """Ground truth, IMU, GNSS and other poses of a log.
+
+    wheels, truth : topics that are used; placed : those of IMU and GNSS, and where the sensors are
+    """
     found = []
     for topic, channel in topics_of(indexes).items():
         if topic == truth:
             found.append(OtherSensor("ground truth", topic, "evaluates the result, is not used for it"))
-        elif role(channel) == "imu":
-            use = "predicts motions where it does so better than the scans" if topic == imu else "not used"
-            found.append(OtherSensor("IMU", topic, use))
-        elif kind(channel) in _GNSS:
-            use = "not used" if role(channel) == "gnss" else "not used: only sensor_msgs/NavSatFix is read"
-            used = "its fixes give the place on Earth, and correct drift where they show any"
-            found.append(OtherSensor("GNSS", topic, used if topic == gnss else use))
+        elif (key := role(channel)) in _USES:
+            sensor, use = _USES[key]
+            unused = f"not used; choose it with --log.{key}_topic {topic}"
+            found.append(OtherSensor(sensor, topic, f"{placed[topic]}; {use}" if topic in placed else unused))
+        elif kind(channel) in _NOT_READ:
+            found.append(OtherSensor("GNSS", topic, "not used: only sensor_msgs/NavSatFix is read"))
         elif has_poses(channel) and topic != wheels:
             use = f"--gt {topic} uses them as ground truth, --log.odometry_topic {topic} as wheels"
             found.append(OtherSensor("poses", topic, f"not used; {use}"))

@@ -8,10 +8,9 @@ from collections import deque
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scanchain.data import LEAST_FIT, Match, Matrix, Pose, RestForce, Vector
+from scanchain.data import GRAVITY_M_S2, LEAST_FIT, Match, Matrix, Pose, RestForce, Vector, unit_of
 from scanchain.odometry.gyro import Gyro
 
-GRAVITY_M_S2 = 9.81
 _FEWEST, _RECENT = 15, 20  # motions whose errors decide whether the accelerometer is used
 _BETTER, _WORSE = 0.9, 1.5  # ratio of squared errors below which it is used, and above which no longer
 _DETERMINED = 0.5  # least information of a match about the position, as a share of the largest of one direction
@@ -27,7 +26,6 @@ _GAIN, _OUTLIER = 0.1, 9.0  # of these factors, and squared innovation in σ² t
 _LEAST = 1e-6  # information along each direction: 1 km
 _CONTRADICTED = 0.04  # factor on the information of a match that its correspondences contradict
 _CAUTION = 4.0  # factor on the predicted variance
-_UNIT = 1.3  # largest ratio of the specific force at first and gravity
 _P, _V, _G, _B = (slice(at, at + 3) for at in (0, 3, 6, 9))  # position, velocity, gravity, bias in the state
 
 
@@ -157,12 +155,10 @@ class Accelerometer:
         """Begin at the last scan with any velocity; False if the samples do not hold gravity."""
         mean = forces.mean(axis=0)
         size = float(np.linalg.norm(mean))
-        is_in_g = 1.0 / _UNIT < size < _UNIT
-        self.unit_m_s2 = GRAVITY_M_S2 if is_in_g else 1.0
-        if not (is_in_g or 1.0 / _UNIT < size / GRAVITY_M_S2 < _UNIT):
+        if not (unit_m_s2 := unit_of(size)):
             self.defect = f"its accelerations do not hold gravity ({size:.2g} m/s²): only its gyro is used"
             return False
-        self.p_lidar_imu, self.is_tracking = gyro.p_lidar_imu, True
+        self.p_lidar_imu, self.is_tracking, self.unit_m_s2 = gyro.p_lidar_imu, True, unit_m_s2
         R_odom = T_odom_last[:3, :3]
         self.x = np.zeros(12)
         self.x[_P] = T_odom_last[:3, 3] + R_odom @ self.p_lidar_imu

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanchain import lie
-from scanchain.data import Mask, Matrix, Pose, Scan, Vector
+from scanchain.data import BRIDGED_S, Mask, Matrix, Pose, Scan, Vector
 from scanchain.errors import counted
 from scanchain.preprocess import ScanMotion, Sweep, Turning
 
@@ -28,7 +28,6 @@ _SCALE = 1.25  # largest ratio of an estimated scale to that of its unit
 _SIGMA_RAD, _SIGMA = 0.002, 0.02  # σ of a measured rotation: from scan to scan, and a share of the rotation
 _BIAS_RAD_S, _WALK = 0.02, 1e-4  # σ of the bias at first, and of its change in rad/s per √s: larger than of MEMS
 _MOST_BIAS_RAD_S, _OUTLIER = 0.1, 3.0  # largest bias that is estimated; σ of a rotation that does not change it
-_BRIDGED_S = 0.15  # longest time without a sample
 _REPEATED, _LEAST_CLIPPED_RAD_S = 4, 0.3  # samples at the largest rate of a saturated gyro, and least such rate
 
 
@@ -327,8 +326,8 @@ def _axes(X: Matrix, Y: Matrix, stated: Matrix | None) -> Iterator[tuple[Matrix,
 
 def _defect(knots_s: Vector, rates: Matrix) -> str:
     """Why rates (M, 3) between the first and the last knot do not give the rotation; empty if they do."""
-    if float(np.diff(knots_s).max()) > _BRIDGED_S:
-        return f"no sample for more than {_BRIDGED_S:g} s"
+    if float(np.diff(knots_s).max()) > BRIDGED_S:
+        return f"no sample for more than {BRIDGED_S:g} s"
     if len(rates) >= _REPEATED and rates.any() and not np.ptp(rates, axis=0).any():
         return "rates that do not change"
     largest = np.abs(rates).max(initial=0.0)

@@ -194,13 +194,8 @@ class _Run:
         if len(self.steps) <= _FEW_SCANS:
             few = f"a trajectory of {counted(len(self.steps), 'scan')}"
             lost.append(f"{few} says nothing about the log; check --start, --end, --every")
-        used = {
-            "wheels": log.odometry_topic,
-            "truth": log.ground_truth_topic,
-            "imu": log.imu.topic if log.imu else "",
-            "gnss": log.gnss.topic if log.gnss else "",
-        }
-        sensors = other_sensors(log.indexes, **used)
+        wheels, truth_topic = log.odometry_topic, log.ground_truth_topic
+        sensors = other_sensors(log.indexes, wheels=wheels, truth=truth_topic, placed=log.placed)
         idle = [f"{each.sensor} {each.topic}: {each.use}" for each in sensors if each.use.startswith("not used")]
         with self.directory.results() as folder:
             truth, note = self.source.accuracy(result, folder)
