@@ -17,14 +17,14 @@ BIAS = np.array([0.3, -0.2, 0.1])
 SIGMA_M_S2 = 0.01
 
 
-def forces_along(truth, chosen, bias=BIAS):
+def forces_along(truth, chosen):
     """Forces at rest of keyframes, with noise; the bias is known from the middle of the drive on."""
     random, forces = np.random.default_rng(0), {}
     for number, scan in enumerate(chosen.tolist()):
         noise = SIGMA_M_S2 * random.standard_normal(3)
         known = (number > len(chosen) // 2) * 1.0
         forces[number] = RestForce(
-            GRAVITY_M_S2 * truth.poses[scan, 2, :3] + bias + noise,
+            GRAVITY_M_S2 * truth.poses[scan, 2, :3] + BIAS + noise,
             SIGMA_M_S2**2 * np.eye(3),
             known * BIAS,
             (1.0 - 0.999 * known) * np.eye(3),

@@ -126,7 +126,7 @@ class Inertial(NamedTuple):
 
 
 class RestForce(NamedTuple):
-    """What an accelerometer would measure at rest, along the axes of the lidar, in m/s².
+    """Specific force at rest by an accelerometer, along the axes of the lidar, in m/s².
 
     force, covariance : specific force (3,), its bias included, and covariance (3, 3)
     bias, bias_covariance : (3,) as far as it is known, and covariance (3, 3)

@@ -207,16 +207,15 @@ class Slam:
         state, first = back_end.finish(progress), back_end.first
         scan_of = np.array([keyframe.scan_index for keyframe in self.keyframes[first:]])
         starts = [start - first for start in back_end.closer.segments.starts]
-        corrected = spread(state.poses[first:], scan_of, odometry.poses, starts)
         components, graph = back_end.closer.segments.components(back_end.graph), back_end.graph
         up, by_gravity = lie.lift(self.T_base_lidar)[2, :3], ""
         if self.at_rest and not first:
             graph, by_gravity = leveled(graph, self.at_rest, self.config.graph)
             state, up = graph.state(), np.array([0.0, 0.0, 1.0])
-            corrected = spread(state.poses, scan_of, odometry.poses, starts)
-            odometry = Trajectory(
-                odometry.stamps_ns, corrected[0] @ lie.between(odometry.poses[0], odometry.poses)
-            )
+        corrected = spread(state.poses[first:], scan_of, odometry.poses, starts)
+        if by_gravity:
+            from_first = lie.between(odometry.poses[0], odometry.poses)
+            odometry = Trajectory(odometry.stamps_ns, corrected[0] @ from_first)
         located = Georeferencing(self.fixes, up, self.config.graph) if self.fixes else None
         if located is not None:
             progress("comparing with the fixes of the GNSS receiver")

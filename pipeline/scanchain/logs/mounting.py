@@ -130,7 +130,7 @@ class Sensor(NamedTuple):
 
     @property
     def place(self) -> str:
-        """Where it is, as text."""
+        """Its pose relative to the lidar, as text."""
         T = self.T_lidar_sensor
         return f"at {place_text(T)} from the lidar" if T is not None else "without a transform, which is estimated"
 

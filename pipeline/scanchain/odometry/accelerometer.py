@@ -73,7 +73,7 @@ class Accelerometer:
         return float(np.trace(self.P[_V, _V])) < _UNKNOWN_M_S**2
 
     def at_rest(self, T_odom_lidar: Pose) -> RestForce | None:
-        """What it would measure at rest in this pose; None while it is not used."""
+        """Specific force at rest in this pose; None while the accelerometer is not used."""
         if not self.is_used:
             return None
         J = np.zeros((3, 12))

@@ -270,7 +270,7 @@ class Predictor:
         return motion, covariance
 
     def at_rest(self, T_odom_lidar: Pose) -> RestForce | None:
-        """What the accelerometer would measure at rest; None where unused or of unknown mounting."""
+        """Specific force at rest; None while the accelerometer is not used, and without a stated mounting."""
         return self.accelerometer.at_rest(T_odom_lidar) if self.gyro.is_mounted else None
 
     @property
