@@ -335,8 +335,9 @@ class Predictor:
                 covariance = definite_inverse(match.information)
                 statistics.update(innovation, covariance.diagonal())
                 if prediction.source is Source.WHEELS:
-                    weighted = np.linalg.solve(prediction.prior.covariance + covariance, innovation)
-                    self.wheels.innovation = math.sqrt(innovation @ weighted / len(innovation))
+                    information = definite_inverse(prediction.prior.covariance + covariance)
+                    square = innovation.dot(information).dot(innovation)
+                    self.wheels.innovation = math.sqrt(square / len(innovation))
 
 
 def _shows_rotation(match: Match, state: State) -> bool:
