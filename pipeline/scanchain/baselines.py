@@ -1,4 +1,4 @@
-"""Third-party odometries by name: KISS-ICP, GenZ-ICP, small_gicp, and Open3D's ICP from scan to scan.
+"""Third-party odometries by name: KISS-ICP, GenZ-ICP, RKO-LIO, small_gicp, and Open3D's ICP from scan to scan.
 
 A new one is a class, as ``Baseline`` describes it, and a line in ``BASELINES``. Outside of the package,
 ``scanchain compare --methods my_module:MyClass`` runs a class of yours, given its table of --config as keywords.
@@ -20,14 +20,15 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Count, NonNegative, Positive
-from scanchain.data import Pose, RawPoints
-from scanchain.errors import MissingExtraError
+from scanchain.data import Inertial, Pose, RawPoints
+from scanchain.errors import InputError, MissingExtraError
 
 
 class Baseline(Protocol):
     """A third-party odometry method, run on the same scans as ours.
 
-    Any class with ``track`` can be compared; without a ``description`` it goes by its name.
+    Any class with ``track`` can be compared; without a ``description`` it goes by its name. One with
+    ``add_inertial`` is given the ``Inertial`` of a scan before the scan, on logs that have an IMU.
     """
 
     @property
@@ -216,6 +217,64 @@ class GenzIcp:
         share = (times - times.min()) / np.ptp(times) if len(times) else times
         self.odometry.register_frame(frame, share)
         return self.at_stamp.move(np.array(self.odometry.last_pose, np.float64), stamp_ns, middle(times))
+
+
+class RkoSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Its defaults. Threads: 0 are all."""
+
+    min_range_m: NonNegative = 1.0
+    max_range_m: Positive = 100.0
+    voxel_size_m: Positive = 1.0
+    max_distance_m: Positive = 0.5
+    max_iterations: Count = 100
+    threads: Annotated[int, Meta(ge=0)] = 0
+
+
+RKO = RkoSettings()
+
+
+class RkoLio:
+    """RKO-LIO: point-to-point, scan to map, with gyro and accelerometer."""
+
+    def __init__(self, settings: RkoSettings = RKO) -> None:
+        library = _imported("rko_lio.lio", "rko-lio")
+        config = _imported("rko_lio.config", "rko-lio").LIOConfig(
+            min_range=settings.min_range_m,
+            max_range=settings.max_range_m,
+            voxel_size=settings.voxel_size_m,
+            max_correspondence_distance=settings.max_distance_m,
+            max_iterations=settings.max_iterations,
+            max_num_threads=settings.threads,
+        )
+        self.description = (
+            f"RKO-LIO, point-to-point scan to map, with the IMU, {settings.min_range_m:g} to "
+            f"{settings.max_range_m:g} m, voxels of {settings.voxel_size_m:g} m, {settings.threads or 'all'} "
+            "threads, its own deskewing where the log has times"
+        )
+        self.odometry = library.LIO(config)
+        self.at_stamp = AtStamp()
+        self.scans, self.has_imu = 0, False
+
+    def add_inertial(self, inertial: Inertial) -> None:
+        """Add the samples since the scan before; without a transform the IMU is taken to lie in the lidar."""
+        self.has_imu = True
+        T_lidar_imu = np.eye(4) if inertial.T_lidar_imu is None else inertial.T_lidar_imu
+        samples = (inertial.accelerations, inertial.rates, inertial.stamps_ns.tolist())
+        for acceleration, rate, stamp_ns in zip(*samples, strict=True):
+            self.odometry.add_imu_measurement(acceleration, rate, stamp_ns, T_lidar_imu)
+
+    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
+        """Register one scan; RKO-LIO's pose holds at the last point, ours at the scan's stamp.
+
+        Raises InputError at the second scan if there has been no sample of an IMU.
+        """
+        if self.scans and not self.has_imu:
+            raise InputError("needs an IMU, of which the log has no sample; leave it out of --methods")
+        self.scans += 1
+        frame, times = finite(points, times_s)
+        since_ns = np.rint(1e9 * times).astype(np.int64) if len(times) else np.zeros(len(frame), np.int64)
+        self.odometry.register_scan(frame, stamp_ns + since_ns)
+        return self.at_stamp.move(self.odometry.pose(), stamp_ns, float(times.max(initial=0.0)))
 
 
 _CLEAR_CYCLE = 10  # of small_gicp's own odometry example, as are the defaults below
@@ -411,6 +470,7 @@ class Entry:
         plane the height, and GenZ-ICP's voxels grow until a scan has thousands of points
     is_raised : whether a 2D scan must be given height, because surfaces are looked for
     forgets : whether a second instance in a process is independent of the first
+    wants_imu : whether it needs a log with an IMU
     """
 
     make: Callable[[Any], Baseline]
@@ -419,6 +479,7 @@ class Entry:
     planar: Struct | None
     is_raised: bool = False
     forgets: bool = True
+    wants_imu: bool = False
 
 
 BASELINES: dict[str, Entry] = {
@@ -431,4 +492,5 @@ BASELINES: dict[str, Entry] = {
     "genz-icp": Entry(GenzIcp, "genz-icp", GENZ, None, forgets=False),
     "genz-icp-indoor": Entry(GenzIcp, "genz-icp", GenzSettings("indoor"), None, forgets=False),
     "genz-icp-kitti": Entry(GenzIcp, "genz-icp", GenzSettings("kitti"), None, forgets=False),
+    "rko-lio": Entry(RkoLio, "rko-lio", RKO, None, wants_imu=True),
 }

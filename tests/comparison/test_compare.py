@@ -14,6 +14,7 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 
+from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.comparison import processes, worker
 from scanchain.comparison.compare import Compared, compare
@@ -318,6 +319,33 @@ def test_the_gyro_is_used_by_the_methods_that_name_the_imu_and_is_a_row_where_th
 
 
 @pytest.mark.usefixtures("in_process")
+def test_a_baseline_is_given_the_samples_of_the_imu_before_each_scan(tmp_path):
+    log = made.log("turns", sensor="vlp-16", seconds=4.0, imu="mems")
+    settings = toml(tmp_path / "gyro.toml", '[gyro]\nmethod = "bad_odometries:Turned"\n')
+    table = run(log, tmp_path, "gyro", "rko-lio", config_file=settings)
+    rko_lio = table.rows[1]
+    poses, true = (
+        read_tum(path).poses
+        for path in (method_folder(tmp_path / "out", "gyro") / "trajectory.tum", log.with_suffix(".tum"))
+    )
+    turned, really = lie.between(poses[0], poses[-1]), lie.between(true[0], true[len(poses) - 1])
+    assert lie.apart(really, turned)[1] < np.radians(2.0) < lie.apart(really, np.eye(4))[1]
+    assert "rko-lio" in default_names(3, has_imu=True) and "rko-lio" not in default_names(3)
+    if rko_lio.status is Status.MISSING:
+        pytest.skip(rko_lio.reason)
+    assert rko_lio.status is Status.OK and rko_lio.figures["ate_m"] < 0.5, text(table)
+
+
+@pytest.mark.usefixtures("in_process")
+def test_rko_lio_says_that_a_log_has_no_imu(tmp_path):
+    [only] = run(made.log("turns", sensor="vlp-16", seconds=4.0), tmp_path, "rko-lio").rows
+    if only.status is Status.MISSING:
+        pytest.skip(only.reason)
+    assert only.status is Status.CRASHED
+    says(only.reason, "needs an IMU, of which the log has no sample")
+
+
+@pytest.mark.usefixtures("in_process")
 def test_methods_for_clouds_follow_planar_scans_in_the_plane(office, tmp_path):
     names = [name for name in default_names(2) if name not in OURS]
     table = run(office, tmp_path, *names, overrides=(Override("log.end_s", "3.0", ""),))
@@ -337,6 +365,7 @@ def test_a_word_stands_for_the_methods_that_begin_with_it():
         (["plicp", "KISS", "open3d"], 2, ["plicp", "kiss-icp", "open3d-p2p", "open3d-gicp"]),
         (["open3d", "kiss_icp"], 3, ["open3d-p2p", "open3d-p2l", "open3d-gicp", "kiss-icp"]),
         (["genz"], 3, ["genz-icp"]),
+        (["rko"], 3, ["rko-lio"]),
         (["plicp+loops"], 3, ["plicp+loops"]),
     ):
         assert [method.name for method in resolve(words, dimension, file=None)] == names

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scanchain import lie
+
 AT_ONCE = ("dies-early", "is-spatial", "is-unsteady")
 
 
@@ -63,3 +65,20 @@ class Shifted:
         pose[0, -1] = self.step_m * self.scans
         self.scans += 1
         return pose
+
+
+class Turned:
+    """Integrates the rates of an IMU, and does not move."""
+
+    def __init__(self):
+        self.T_odom_lidar, self.last_ns = np.eye(4), 0
+
+    def add_inertial(self, inertial):
+        rates = inertial.rates @ inertial.T_lidar_imu[:3, :3].T
+        for stamp_ns, rate in zip(inertial.stamps_ns.tolist(), rates, strict=True):
+            lasted_s = 1e-9 * (stamp_ns - self.last_ns) if self.last_ns else 0.0
+            self.T_odom_lidar = self.T_odom_lidar @ lie.exp(np.concatenate([np.zeros(3), lasted_s * rate]))
+            self.last_ns = stamp_ns
+
+    def track(self, points, times_s, stamp_ns):
+        return self.T_odom_lidar

@@ -47,7 +47,7 @@ class Method(Struct, frozen=True):
 
 def default_names(dimension: int, *, has_imu: bool = False) -> tuple[str, ...]:
     """Methods that apply to logs of this dimension, with or without an IMU."""
-    others = [name for name in BASELINES if name not in _ON_REQUEST]
+    others = [name for name, entry in BASELINES.items() if name not in _ON_REQUEST and has_imu >= entry.wants_imu]
     planar = [name for name in others if BASELINES[name].planar is not None]
     with_imu = ("plicp+imu",) if has_imu else ()
     return (*MATCHERS, "plicp+loops", *with_imu, *(others if dimension == 3 else planar))
@@ -132,9 +132,9 @@ def _spelled_out(name: str, dimension: int) -> Sequence[str]:
     word = name.lower().replace("_", "-")
     if is_class_name(name) or name in OURS:
         return [name]
-    return [each for each in default_names(dimension) if word != each and each.startswith(f"{word}-")] or [
-        word if word in BASELINES else name
-    ]
+    return [
+        each for each in default_names(dimension, has_imu=True) if word != each and each.startswith(f"{word}-")
+    ] or [word if word in BASELINES else name]
 
 
 def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:

@@ -55,8 +55,11 @@ class _Others:
         else:
             self.baseline = plugins.load(method.base, "track")(**method.settings)
         self.description = str(getattr(self.baseline, "description", "")) or method.base
+        self.add_inertial = getattr(self.baseline, "add_inertial", None)
 
     def track(self, scan: Scan) -> Pose:
+        if scan.inertial is not None and self.add_inertial is not None:
+            self.add_inertial(scan.inertial)
         return self.baseline.track(scan.points, scan.times_s, scan.stamp_ns)
 
     def measure_errors(self, scans: StoredScans, folder: Path) -> None:
