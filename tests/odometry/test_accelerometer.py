@@ -1,5 +1,7 @@
 """The accelerometer: positions along its samples, gravity, faults, and the places where it helps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,8 +40,11 @@ def samples_at(times_s, unit, step_s=1e-3):
     return rates, (np.einsum("nji,nj->ni", now[:, :3, :3], forces) + BIAS) / unit
 
 
-def drive(scans, *, blind=0, unit=1.0, gravity=True, noise_m=0.002):
-    """An accelerometer after these scans, the last ``blind`` of them lost, and the errors of its positions."""
+def drive(scans, *, blind=0, unit=1.0, gravity=True, noise_m=0.002, corridor=None):
+    """An accelerometer after these scans, the last ``blind`` of them lost, and the errors of its positions.
+
+    From the scan ``corridor`` on, matches leave a direction open, which they take for slightly different ones.
+    """
     random, gyro, accelerometer, errors = np.random.default_rng(0), Gyro(3), Accelerometer(), []
     T_last = before = lidar_at(np.zeros(1))[0]
     for k in range(scans):
@@ -60,6 +65,12 @@ def drive(scans, *, blind=0, unit=1.0, gravity=True, noise_m=0.002):
         else:
             T[:3, 3] += noise_m * random.normal(size=3)
             match = first_match(T, np.ones((100, 3)), load_settings(3).config.matching)
+        if corridor is not None and k >= corridor:
+            T[0, 3] = accelerometer.position[0]
+            open_ = T[:3, :3].T @ lie.exp(np.concatenate([np.zeros(3), 0.005 * random.normal(size=3)]))[:3, 0]
+            information = np.eye(6)
+            information[:3, :3] -= np.outer(open_, open_)
+            match = replace(match, information=1e6 * information, observability=0.1)
         gyro.correct(lie.between(T_last, T) if k else None)
         accelerometer.correct(T, match, (T_last @ lie.between(before, T_last))[:3, 3])
         before, T_last = T_last, T
@@ -81,6 +92,11 @@ def test_where_scans_are_lost_it_continues_the_motion_for_seconds():
     assert errors[-20:].max() < 0.15  # of 6 m, and 2 s on a curve
     assert np.isnan(accelerometer.innovation)
     assert np.trace(accelerometer.covariance) ** 0.5 > errors[-1] / 3.0  # and says how far off it may be
+
+
+def test_a_direction_that_scans_leave_open_is_not_measured_by_their_noise_across_it():
+    accelerometer, errors = drive(200, corridor=30)
+    assert errors[-1] < np.sqrt(accelerometer.P[0, 0]) < 2.0  # of 60 m; if it were measured 1.2 m off, and 0.1 m
 
 
 def test_accelerations_in_g_are_converted_and_such_without_gravity_not_used():

@@ -83,7 +83,7 @@ def test_errors_at_a_keyframe_are_the_mean_of_fitting_scans_and_the_share_of_the
     assert first.variance_factor == 2.5
 
 
-def covariances(dimension, information, scans):
+def covariances(dimension, information, scans, gained=None):
     """Of the motion since the keyframe, after scans 0.1 m apart: (fit, whether it is measured, state, error)."""
     front_end = FrontEnd(configured(dimension, {"odometry.keyframe_distance_m": 100.0}), np.eye(dimension + 1))
     nothing, k, told = np.empty((0, dimension)), len(information), []
@@ -93,7 +93,7 @@ def covariances(dimension, information, scans):
         prior = Prior(T @ lie.exp(off), 1e-4 * np.eye(k), np.ones(k), is_measured)
         match = first_match(T, np.zeros((9, dimension)), configured(dimension).matching)
         match = replace(match, information=information, fit=fit)
-        tracked = Tracked(None, nothing, nothing, T, match, state, "", prior, 0.0, 0.0, 0.0)
+        tracked = Tracked(None, nothing, nothing, T, match, state, "", prior, 0.0, 0.0, 0.0, gained)
         front_end.odometry.process = lambda scan, tracked=tracked: tracked
         front_end.locate(None)
         told.append(np.linalg.inv(front_end.information + 1e-9 * np.eye(k)))
@@ -111,6 +111,13 @@ def test_where_scans_see_nothing_along_uncertainty_grows_over_those_without_a_wh
     )
     assert np.allclose(whole[1:], 0.01 * scan[1:], rtol=1e-3) and np.allclose(holed, whole)
     assert (without > 1e4).all()  # what came before the first reading is unknown up to the next keyframe
+
+
+def test_where_scans_see_nothing_along_uncertainty_grows_by_what_the_filter_of_the_imu_gains():
+    scans = [(1.0, index > 0, State.DEGENERATE, np.zeros(6)) for index in range(9)]
+    information = np.diag([0.0, 1e6, 1e6, 1e6, 1e6, 1e6])
+    found = covariances(3, information, scans, gained=1e-6 * np.eye(6))[1:, 0, 0]
+    assert np.allclose(found, 1e-6 * np.arange(1, 9), rtol=2e-2)  # prior.covariance, of the position, is 1e-4
 
 
 @pytest.mark.parametrize("is_measured", [True, False])

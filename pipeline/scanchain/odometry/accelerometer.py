@@ -24,8 +24,10 @@ _NORM = 0.03  # m/s², σ of the magnitude of gravity
 _MOST = 100.0  # largest factor on a variance
 _GAIN, _OUTLIER = 0.1, 9.0  # of these factors, and squared innovation in σ² that changes them most
 _LEAST = 1e-6  # information along each direction: 1 km
+_LEAK = 1e-3  # share of the largest information that an open direction seems to have if it is off by 2°
 _CONTRADICTED = 0.04  # factor on the information of a match that its correspondences contradict
 _CAUTION = 4.0  # factor on the predicted variance
+_LEAST_GROWTH_M2 = 1e-8  # of the variance of the position from scan to scan
 _P, _V, _G, _B = (slice(at, at + 3) for at in (0, 3, 6, 9))  # position, velocity, gravity, bias in the state
 
 
@@ -55,8 +57,10 @@ class Accelerometer:
         self.p_lidar_imu = np.zeros(3)
         self.position = np.zeros(3)  # predicted, of the lidar
         self.covariance = np.zeros((3, 3))  # of it, in the lidar's frame
+        self.gained = np.zeros((3, 3))  # by which that of the position grew since the last scan
         self.R_odom_lidar = np.eye(3)  # predicted by the gyro
         self.last_m, self.innovation = np.zeros(3), math.nan  # innovation of the last match; normalized
+        self.last_C = np.zeros((3, 3))  # of the last match
         self.of_prediction = self.of_match = 1.0  # factors on variances
         self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared, in σ²: ours, of the last motion
         self.squares, self.compared = np.zeros(2), 0  # sums of all of them in m²
@@ -95,13 +99,15 @@ class Accelerometer:
         changes = np.einsum("nij,nj->ni", R, 0.5 * (forces[1:] + forces[:-1]))
         F = np.eye(12) + lasted_s * _ONCE + 0.5 * lasted_s**2 * _TWICE
         F[_P, _B], F[_V, _B] = -np.einsum("n,nij->ij", left_s, R), -R.sum(axis=0)
-        self.x = F @ self.x
+        before, self.x = self.P[_P, _P], F @ self.x
         self.x[_P] += left_s @ changes
         self.x[_V] += changes.sum(axis=0)
         self.P = F @ self.P @ F.T + self._noise(lasted_s, forces)
         R_now = self.R_odom_lidar = R_odom @ R_last[-1]
         self.position = self.x[_P] - R_now @ self.p_lidar_imu
         self.covariance = _CAUTION * R_now.T @ self.P[_P, _P] @ R_now
+        growth, axes = np.linalg.eigh(_CAUTION * R_now.T @ (self.P[_P, _P] - before) @ R_now)
+        self.gained = (axes * np.maximum(growth, _LEAST_GROWTH_M2)) @ axes.T
 
     def correct(self, T_odom_lidar: Pose, match: Match | None, continued: Vector) -> None:
         """Update by the pose of a scan that is matched, None if it is lost.
@@ -117,8 +123,10 @@ class Accelerometer:
         if match.fit < LEAST_FIT:
             information = _CONTRADICTED * information
         C = np.linalg.inv(information + _LEAST * np.eye(6))[:3, :3] + _POSITION_M**2 * np.eye(3)
-        C = R @ C @ R.T
-        self._compare(T_odom_lidar[:3, 3], continued, np.linalg.inv(C).astype(np.float64))
+        C = self._without_leaks(R @ C @ R.T)
+        weight = np.linalg.inv(0.5 * (C + self.last_C)).astype(np.float64)  # of the motion since the last match
+        self.last_C = C.copy()
+        self._compare(T_odom_lidar[:3, 3], continued, weight)
         innovation = T_odom_lidar[:3, 3] + R @ self.p_lidar_imu - self.x[_P]
         C *= self.of_match
         weighted = np.linalg.solve(self.P[_P, _P] + C, innovation)
@@ -150,6 +158,18 @@ class Accelerometer:
             f"IMU: its accelerometer predicts the translation of {100.0 * self.used / self.scans:.0f} % of the "
             f"scans, to {ours_m:.2g} m (the last motion continued: {others_m:.2g} m)"
         )
+
+    def _without_leaks(self, C: Matrix) -> Matrix:
+        """Covariance (3, 3) of a match, open along the direction that the filter knows least if it nearly is.
+
+        Scans that leave the same direction open take it for slightly different ones: together they would seem to
+        measure it (Huang, Mourikis & Roumeliotis 2010).
+        """
+        axis, information = np.linalg.eigh(self.P[_P, _P])[1][:, -1], np.linalg.inv(C)
+        if axis @ information @ axis > _LEAK * np.linalg.norm(information, 2):
+            return C
+        across = np.eye(3) - np.outer(axis, axis)
+        return np.linalg.inv(across @ information @ across + _LEAST * np.eye(3)).astype(np.float64)
 
     def _begin(self, T_odom_last: Pose, gyro: Gyro, forces: Matrix) -> bool:
         """Begin at the last scan with any velocity; False if the samples do not hold gravity."""

@@ -104,7 +104,8 @@ class FrontEnd:
         """Information (k, k) of the motion since the last keyframe, from the match and all predictions since.
 
         Wheel errors are correlated from scan to scan, so that their standard deviations add up, not the variances,
-        for scans without a reading in between, too. Without wheels, only the match counts.
+        for scans without a reading in between, too. An IMU tells by how much the covariance grows. Without either,
+        only the match counts.
         """
         prior, of_match = tracked.prior, tracked.match.information
         self.since_keyframe += 1
@@ -120,9 +121,11 @@ class FrontEnd:
             self.inflation = Ad @ self.inflation @ Ad.T + _inflation_of(tracked)
         if self.covariance is None:
             return self._inflated(of_match)
-        predicted = n * prior.covariance
+        predicted, growth = (
+            (n * prior.covariance, n / max(n - 1, 1)) if tracked.gained is None else (tracked.gained, 1.0)
+        )
         if n > 1:
-            predicted = predicted + (n / (n - 1) * Ad).dot(self.covariance).dot(Ad.T)
+            predicted = predicted + (growth * Ad).dot(self.covariance).dot(Ad.T)
         information = definite_inverse(predicted)
         if tracked.state is not State.LOST:
             information += of_match

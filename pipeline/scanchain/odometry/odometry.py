@@ -37,7 +37,7 @@ class Tracked(msgspec.Struct, frozen=True):
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed to the
     scan's stamp, at which ``T_odom_lidar`` holds, in the lidar frame; the seconds are the run times by stage.
-    ``prior`` is that of this pose, its covariance that at the middle of the scan;
+    ``prior`` is that of this pose, its covariance that at the middle of the scan; ``gained`` as in ``Prediction``;
     ``elsewhere_m`` is how far away it may be where its motion is unknown, else 0;
     ``is_repeated`` if its points are those of the scan before;
     ``spans`` are the origins of the rays of ``points``, () where all start at that of the lidar frame;
@@ -56,6 +56,7 @@ class Tracked(msgspec.Struct, frozen=True):
     preprocess_s: float
     match_s: float
     map_s: float
+    gained: NDArray[np.float64] | None = None
     elsewhere_m: float = 0.0
     is_repeated: bool = False
     spans: tuple[RaySpan, ...] = ()
@@ -176,6 +177,7 @@ class Odometry:
             state=_reported(registered),
             reason=match.reason,
             prior=prediction.prior,
+            gained=prediction.gained,
             preprocess_s=prepared.seconds + began - started,
             match_s=aligned - began,
             map_s=working_s() - aligned,

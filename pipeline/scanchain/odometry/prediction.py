@@ -59,6 +59,8 @@ class Prediction(msgspec.Struct, frozen=True):
     """The predicted pose of a scan, and the motion before it, for other initial poses and for deskewing.
 
     prior : predicted pose and its covariance
+    gained : (k, k) covariance that the motion adds to that of the motions before, which it is independent of; None
+        where errors are correlated from scan to scan
     source : what predicts it
     is_guess : whether scans are missing before this one, so that the error may be large
     scan_motion : that during the last scan, with the rotation during this one where a gyro measures it
@@ -71,6 +73,7 @@ class Prediction(msgspec.Struct, frozen=True):
     """
 
     prior: Prior
+    gained: Matrix | None
     source: Source
     is_guess: bool
     scan_motion: ScanMotion
@@ -218,6 +221,7 @@ class Predictor:
         times, turning = self.intervals, self.gyro.predict(scan, sweep)
         self.accelerometer.predict(self.T_odom_lidar, self.gyro)
         interval_s = times.to(scan)
+        gained: Matrix | None = None
         wheel = self.wheels.motion(scan) if by_wheels and times.last_scan is not None else None
         source, is_guess, jump_m = Source.CONSTANT_VELOCITY if wheel is None else Source.WHEELS, False, 0.0
         self.wheels.is_contradicted = False
@@ -228,6 +232,8 @@ class Predictor:
                 jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
         elif turning is not None and self.accelerometer.is_used:
             source, motion, covariance = Source.IMU, *self._by_imu()
+            gained = covariance.copy()
+            gained[:3, :3] = self.accelerometer.gained
         elif times.is_gap(interval_s):
             motion = _motion_over(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, is_guess = self.filter.any_motion, True
@@ -246,6 +252,7 @@ class Predictor:
         T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(
             prior=Prior(T_predicted, covariance, widest, is_measured=source.is_measured),
+            gained=gained,
             source=source,
             is_guess=is_guess,
             scan_motion=ScanMotion(self.scan_motion.twist, turning),
