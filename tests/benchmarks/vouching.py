@@ -56,7 +56,7 @@ BARS = "Bars: ≥ 99 % of wrong motions flagged, ≤ 2 % of right ones, no bad r
 QUICK = 7  # every n-th case
 CHECKS = {  # operating points
     "fit": 0.6,
-    "wheel_innovation": 8.0,
+    "wheel_disagreement": 8.0,
     "velocity_innovation": 4.0,
     "observability": 1.0,
     "overlap_ratio": 0.667,

@@ -131,3 +131,11 @@ def test_info_says_what_it_is_used_for(log):
     assert use == "predicts motions where it does so better than the scans"
     said = describe([log], LogConfig(imu_topic="none"))["sensors"]
     assert "not used; choose it with --log.imu_topic /imu/data" in [each.use for each in said]
+    said = describe([log], LogConfig(), uses_imu=False)["sensors"]
+    assert "not used: odometry.imu is false" in [each.use for each in said]
+
+
+def test_info_does_not_ask_for_the_imu_to_be_chosen_where_the_lidar_is_not(log):
+    found = describe([log], LogConfig(topic="/nowhere"))
+    assert found["problem"]
+    assert "predicts motions where it does so better than the scans" in [each.use for each in found["sensors"]]

@@ -40,7 +40,8 @@ def info(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...
     """
     from scanchain.logs.info import describe
 
-    found = describe(logs, load_settings(overrides=overrides).config.log)
+    config = load_settings(overrides=overrides).config
+    found = describe(logs, config.log, uses_imu=config.odometry.imu)
     click.echo(options.json_text(found) if as_json else _info_text(found))
     return int(bool(found["problem"]))
 

@@ -18,12 +18,13 @@ from scanchain.logs.stream import ends_of, whole_span
 from scanchain.logs.topics import find_ground_truth, find_odometry, other_sensors, topics_of
 
 
-def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
+def describe(sources: Sequence[Source], config: LogConfig, *, uses_imu: bool = True) -> dict[str, Any]:
     """Files and topics of a log, the topics that a run would use, and problems. Raises InputError if it is no log.
 
     ``lidar`` is empty if a run could not choose a topic; ``problem`` is the reason. ``sensors`` are those other
     than lidar and wheels. Units are in the names, lengths in meters; ``T_base_lidar`` is a list of rows, of the
     first pose if the lidar moves (``mount_motion``); ``base_frame`` is empty if the log does not state it.
+    uses_imu : odometry.imu
     """
     indexes = index_files(sources, config)
     whole = whole_span(indexes)
@@ -46,7 +47,9 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
         "scans": log.scan_count if log else 0,
         "odometry": log.odometry_topic if log else wheels,
         "wheels": log.wheels if log else wheels,
-        "sensors": other_sensors(indexes, wheels=wheels, truth=truth, placed=log.placed if log else {}),
+        "sensors": other_sensors(
+            indexes, wheels=wheels, truth=truth, placed=log.placed if log else None, uses_imu=uses_imu
+        ),
         "point_times": log.assumed_point_times() if log else "",
         "T_base_lidar": log.T_base_lidar.tolist() if log else [],
         "base_frame": log.mounting.base if log else "",

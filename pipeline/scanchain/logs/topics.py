@@ -96,11 +96,18 @@ class OtherSensor:
 
 
 def other_sensors(
-    indexes: Sequence[FileIndex], *, wheels: str, truth: str, placed: Mapping[str, str]
+    indexes: Sequence[FileIndex],
+    *,
+    wheels: str,
+    truth: str,
+    placed: Mapping[str, str] | None,
+    uses_imu: bool = True,
 ) -> list[OtherSensor]:
     """Ground truth, IMU, GNSS and other poses of a log.
 
-    wheels, truth : topics that are used; placed : those of IMU and GNSS, and where the sensors are
+    wheels, truth : topics that are used; placed : those of IMU and GNSS, and where the sensors are; None where
+        they cannot be chosen yet, since the lidar is not
+    uses_imu : odometry.imu
     """
     found = []
     for topic, channel in topics_of(indexes).items():
@@ -108,8 +115,12 @@ def other_sensors(
             found.append(OtherSensor("ground truth", topic, "evaluates the result, is not used for it"))
         elif (key := role(channel)) in _USES:
             sensor, use = _USES[key]
-            unused = f"not used; choose it with --log.{key}_topic {topic}"
-            found.append(OtherSensor(sensor, topic, f"{placed[topic]}; {use}" if topic in placed else unused))
+            if key == "imu" and not uses_imu:
+                use = "not used: odometry.imu is false"
+            elif placed is not None:
+                unused = f"not used; choose it with --log.{key}_topic {topic}"
+                use = f"{placed[topic]}; {use}" if topic in placed else unused
+            found.append(OtherSensor(sensor, topic, use))
         elif kind(channel) in _NOT_READ:
             found.append(OtherSensor("GNSS", topic, "not used: only sensor_msgs/NavSatFix is read"))
         elif has_poses(channel) and topic != wheels:

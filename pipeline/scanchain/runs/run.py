@@ -195,7 +195,8 @@ class _Run:
             few = f"a trajectory of {counted(len(self.steps), 'scan')}"
             lost.append(f"{few} says nothing about the log; check --start, --end, --every")
         wheels, truth_topic = log.odometry_topic, log.ground_truth_topic
-        sensors = other_sensors(log.indexes, wheels=wheels, truth=truth_topic, placed=log.placed)
+        imu = results.result.config.odometry.imu
+        sensors = other_sensors(log.indexes, wheels=wheels, truth=truth_topic, placed=log.placed, uses_imu=imu)
         idle = [f"{each.sensor} {each.topic}: {each.use}" for each in sensors if each.use.startswith("not used")]
         with self.directory.results() as folder:
             truth, note = self.source.accuracy(result, folder)

@@ -54,7 +54,7 @@ class Wheels(Check):
     mounting : correction of the assumed mounting, estimated from the motions; None unless it is clearly wrong
     """
 
-    name, kind, column, source = "wheels", Kind.WHEELS, "wheel_innovation", "wheel"
+    name, kind, column, source = "wheels", Kind.WHEELS, "wheel_disagreement", "wheel"
     limit, harmless = 8.0, (Kind.WHEELS_SLIP,)
 
     def __init__(self, evidence: Evidence) -> None:
