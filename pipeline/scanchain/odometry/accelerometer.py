@@ -6,7 +6,6 @@ import math
 from collections import deque
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from scanchain.data import GRAVITY_M_S2, LEAST_FIT, Match, Matrix, Pose, RestForce, Vector, unit_of
 from scanchain.odometry.gyro import Gyro
@@ -24,7 +23,7 @@ _NORM = 0.03  # m/s², σ of the magnitude of gravity
 _MOST = 100.0  # largest factor on a variance
 _GAIN, _OUTLIER = 0.1, 9.0  # of these factors, and squared innovation in σ² that changes them most
 _LEAST = 1e-6  # information along each direction: 1 km
-_LEAK = 1e-3  # share of the largest information that an open direction seems to have if it is off by 2°
+_LEAK = 1e-3  # share of the information that an open direction seems to have if it is off by 2°
 _CONTRADICTED = 0.04  # factor on the information of a match that its correspondences contradict
 _CAUTION = 4.0  # factor on the predicted variance
 _LEAST_GROWTH_M2 = 1e-8  # of the variance of the position from scan to scan
@@ -57,7 +56,7 @@ class Accelerometer:
         self.p_lidar_imu = np.zeros(3)
         self.position = np.zeros(3)  # predicted, of the lidar
         self.covariance = np.zeros((3, 3))  # of it, in the lidar's frame
-        self.gained = np.zeros((3, 3))  # by which that of the position grew since the last scan
+        self.growth = np.zeros((3, 3))  # of that of the position since the last scan, in the lidar's frame
         self.R_odom_lidar = np.eye(3)  # predicted by the gyro
         self.last_m, self.innovation = np.zeros(3), math.nan  # innovation of the last match; normalized
         self.last_C = np.zeros((3, 3))  # of the last match
@@ -106,8 +105,13 @@ class Accelerometer:
         R_now = self.R_odom_lidar = R_odom @ R_last[-1]
         self.position = self.x[_P] - R_now @ self.p_lidar_imu
         self.covariance = _CAUTION * R_now.T @ self.P[_P, _P] @ R_now
-        growth, axes = np.linalg.eigh(_CAUTION * R_now.T @ (self.P[_P, _P] - before) @ R_now)
-        self.gained = (axes * np.maximum(growth, _LEAST_GROWTH_M2)) @ axes.T
+        self.growth = R_now.T @ (self.P[_P, _P] - before) @ R_now
+
+    @property
+    def gained(self) -> Matrix:
+        """Covariance (3, 3) by which that of the position grew since the last scan, in the lidar's frame."""
+        growth, axes = np.linalg.eigh(_CAUTION * self.growth)
+        return (axes * np.maximum(growth, _LEAST_GROWTH_M2)) @ axes.T
 
     def correct(self, T_odom_lidar: Pose, match: Match | None, continued: Vector) -> None:
         """Update by the pose of a scan that is matched, None if it is lost.
@@ -138,7 +142,10 @@ class Accelerometer:
         if square > _OUTLIER:
             C += np.outer(innovation, innovation)
         self._update(np.eye(3, 12), innovation, C)
-        turned = _TURNED * np.cross(Rotation.from_matrix(R @ self.R_odom_lidar.T).as_rotvec(), self.x[_G])
+        turn = (
+            R @ self.R_odom_lidar.T
+        )  # by the match, relative to the gyro; small: hat(its angles) = (turn − turnᵀ) / 2
+        turned = 0.5 * _TURNED * (turn - turn.T) @ self.x[_G]
         self.P[_G, _G] += np.outer(turned, turned)
         size, along = float(np.linalg.norm(self.x[_G])), np.zeros((1, 12))
         along[0, _G] = self.x[_G] / size
@@ -166,7 +173,7 @@ class Accelerometer:
         measure it (Huang, Mourikis & Roumeliotis 2010).
         """
         axis, information = np.linalg.eigh(self.P[_P, _P])[1][:, -1], np.linalg.inv(C)
-        if axis @ information @ axis > _LEAK * np.linalg.norm(information, 2):
+        if axis @ information @ axis > _LEAK * np.trace(information):
             return C
         across = np.eye(3) - np.outer(axis, axis)
         return np.linalg.inv(across @ information @ across + _LEAST * np.eye(3)).astype(np.float64)
@@ -203,7 +210,7 @@ class Accelerometer:
         self.squares += ours @ ours, others @ others
         self.compared += 1
         if len(self.errors) >= _FEWEST:
-            of_ours, of_others = np.sum(self.errors, axis=0).tolist()
+            of_ours, of_others = map(sum, zip(*self.errors, strict=True))
             self.is_trusted = of_ours < (_WORSE if self.is_trusted else _BETTER) * of_others
 
     def _adapt(self, square: float, *, persists: bool) -> None:

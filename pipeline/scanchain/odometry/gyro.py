@@ -83,8 +83,8 @@ class Gyro:
         """True while it predicts the rotations of the last scans better."""
         if len(self.errors) < _FEWEST:
             return False
-        ours, others = np.sum(self.errors, axis=0)
-        return bool(ours < others)
+        ours, others = map(sum, zip(*self.errors, strict=True))
+        return ours < others
 
     @property
     def is_mounted(self) -> bool:
@@ -280,11 +280,11 @@ class Gyro:
 
 def _interpolated(at_s: Vector, times_s: Vector, values: Matrix) -> Matrix:
     """Values (M, n) at times (M,), interpolated at others (K,): (K, n); beyond the ends those of the ends."""
-    after = np.clip(np.searchsorted(times_s, at_s), 1, max(len(times_s) - 1, 1))
+    after = np.minimum(np.maximum(np.searchsorted(times_s, at_s), 1), max(len(times_s) - 1, 1))  # clip is slow
     if len(times_s) == 1:
         return np.repeat(values, len(at_s), axis=0)
     before_s = times_s[after - 1]
-    share = np.clip((at_s - before_s) / (times_s[after] - before_s), 0.0, 1.0)[:, None]
+    share = np.minimum(np.maximum((at_s - before_s) / (times_s[after] - before_s), 0.0), 1.0)[:, None]
     return values[after - 1] * (1.0 - share) + values[after] * share
 
 
