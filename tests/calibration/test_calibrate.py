@@ -10,7 +10,7 @@ from click.testing import CliRunner
 import scanchain
 from scanchain import lie
 from scanchain.__main__ import scanchain as command
-from scanchain.calibration import Calibration, Parameter, calibrate
+from scanchain.calibration import Calibration, Parameter, calibrate, delay_of_wheels
 from scanchain.errors import InputError
 from scanchain.runs.job import Progress
 from scanchain.settings import load_settings
@@ -107,6 +107,29 @@ def test_wheels_are_read_earlier_and_their_motions_divided_by_the_scales(log):
     np.testing.assert_allclose(halved, steps * [0.5, 0.5, 0.5, 2.0, 2.0, 2.0], atol=1e-9)
     late = [scan.T_odom_base for scan in scanchain.open_log(log, odometry_delay_s=0.1)]
     np.testing.assert_allclose(late[10:-1], usual[11:], atol=1e-9)
+
+
+def test_scans_wait_for_wheels_that_are_later_than_half_a_second():
+    usual, late = (made.log("office", seconds=6, drift=0.0, wheels_delay_s=delay_s) for delay_s in (0.0, 0.66))
+    usual, late = list(scanchain.open_log(usual)), list(scanchain.open_log(late, odometry_delay_s=0.66))
+    for before, after in zip(usual[:50], late[:50], strict=True):
+        expected, found = (lie.between(scans[20].T_odom_base, each.T_odom_base) for scans, each in
+            ((usual, before), (late, after)))  # fmt: skip
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert [scan.T_odom_base is None for scan in late[50:]] == [False] * 4 + [True] * 6
+
+
+def test_the_delay_of_wheels_is_found_from_parts_of_a_log_and_without_wheels_there_is_none():
+    late = made.log("office", seconds=40, wheels_delay_s=-0.3)
+    assert delay_of_wheels(scanchain.open_log(late)) == pytest.approx(-0.3, abs=0.021)
+    assert delay_of_wheels(scanchain.open_log(made.log("office", seconds=12))) == 0.0
+    assert delay_of_wheels(scanchain.open_log(shared_data("2d/mocap_room_1.bag"))) == 0.0
+
+
+def test_wheels_whose_stamps_jitter_by_more_than_a_scan_get_no_parameters():
+    log = scanchain.open_log(shared_data("2d/intel.mcap"), end_s=300.0)
+    found = calibrate(log, load_settings(2).config, Progress())
+    assert found.keys == {} and "contradict" in found.parameters[0].why
 
 
 def test_samples_of_a_late_imu_come_with_the_scans_in_which_they_were_measured(log):

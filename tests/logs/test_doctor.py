@@ -71,6 +71,17 @@ def test_a_healthy_log_is_all_well(tmp_path):
     assert found["damage"].found.startswith("40 scans") and "0 of 40 scans without" in found["wheels"].found
 
 
+def test_late_wheels_are_a_warning_with_the_key_that_mends_them(capfd):
+    log = made.log("office", seconds=40, wheels_delay_s=0.66)
+    assert main(["doctor", str(log), "--json"]) == 0
+    (found,) = (each for each in json.loads(capfd.readouterr().out)["findings"] if each["check"] == "wheels")
+    assert "its stamps are 0.66 s late" in found["found"] and found["severity"] == "warning"
+    flag, value = found["fix"].split()
+    assert main(["doctor", str(log), "--json", flag, value]) == 0
+    (mended,) = (each for each in json.loads(capfd.readouterr().out)["findings"] if each["check"] == "wheels")
+    assert (flag, value) == ("--log.odometry_delay_s", "0.66") and "late" not in mended["found"]
+
+
 def covered(*numbers):
     """The room, but for scans in which all returns are of the robot itself."""
     return lambda k: np.full(100, 0.2) if k in numbers else room(k)

@@ -326,6 +326,24 @@ def test_wheels_slip_once_between_two_seconds_and_nowhere_else(tmp_path):
         assert np.abs(more_m[:99]).max() < 1e-6 and np.abs(more_m[151:]).max() < 1e-6
 
 
+def test_late_wheels_report_at_each_stamp_what_was_before_it(tmp_path):
+    places = []
+    for name, delay_s in (("on_time", 0.0), ("late", 0.1)):
+        simulate("office", tmp_path / f"{name}.mcap", duration_s=4.0, drift=0.0, wheels_delay_s=delay_s)
+        found = [each.pose.pose.position for _, each in messages(tmp_path / f"{name}.mcap", "/odom")]
+        places.append(np.array([(place.x, place.y) for place in found]))
+    np.testing.assert_allclose(np.diff(places[1][5:], axis=0), np.diff(places[0][:-5], axis=0), atol=1e-6)
+
+
+def test_wheels_that_slip_are_found_in_space_as_in_the_plane(tmp_path):
+    simulate("town", tmp_path / "a.mcap", duration_s=15.0, sensor="vlp-16", wheels_slip=Slip(8.0, 10.0, 15.0))
+    reason = scanchain.run(tmp_path / "a.mcap", tmp_path / "run", recording=False).metrics.verdict_reason
+    start_s, end_s, size_m = map(
+        float, re.findall(r"\(([\d.]+) to ([\d.]+) s\): wheels disagree by ([\d.]+) m", reason)[0]
+    )
+    assert 7.5 < start_s < 8.5 and 9.5 < end_s < 10.5 and 2.0 < size_m < 4.0
+
+
 @pytest.mark.slow
 def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tmp_path):
     code = main(
@@ -419,6 +437,7 @@ def test_a_town_log_reads_back(tmp_path):
         ({"start_m": -1.0}, "start_m -1 is out of range"),
         ({"world": "turns", "reverse": True}, "turns has no closed route"),
         ({"wheels_slip": Slip(3.0, 2.0, 1.0)}, "wheels_slip from 3 to 2 s"),
+        ({"wheels_delay_s": 11.0}, "wheels_delay_s 11 is out of range; choose one from -10 to 10"),
     ],
 )
 def test_a_wrong_argument_is_one_line_and_leaves_no_file(tmp_path, arguments, message):

@@ -1,5 +1,5 @@
 """Parameters of sensors, estimated from the motion of a log."""
 
-from scanchain.calibration.calibrate import Calibration, Parameter, calibrate
+from scanchain.calibration.calibrate import Calibration, Parameter, calibrate, delay_of_wheels
 
-__all__ = ["Calibration", "Parameter", "calibrate"]
+__all__ = ["Calibration", "Parameter", "calibrate", "delay_of_wheels"]

@@ -23,10 +23,12 @@ from scanchain.logs.messages.lidar import with_offsets
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.stream import decoded_messages
 from scanchain.odometry import Odometry, Tracked
+from scanchain.odometry.delay import WheelDelay
 from scanchain.preprocess import first_per_voxel
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.registration.search import evenly
 from scanchain.runs.job import Progress
+from scanchain.settings import Override, load_settings
 
 _SCANS, _FEWEST, _POINTS = 16, 5, 3500  # scans of a window, least number; most points of each lidar in each scan
 _SPACING, _DENSE = 0.9, 0.4  # distance of the scans of a window, in cells; with several lidars
@@ -40,6 +42,8 @@ _DEG = 180.0 / math.pi
 _UNITS = {"deg": (0.3, _DEG), "m": (0.05, 1.0), "": (0.01, 1.0), "s": (0.02, 1.0), "deg/s": (0.1, _DEG)}
 # largest σ of an observable parameter by its unit, and factor from SI
 _ANGLES = ("roll", "pitch", "yaw")
+_AT, _WINDOW = (0.5, 0.25, 0.75, 0.0, 1.0), 300  # windows in which the delay of wheels is found, and their scans
+_WITHOUT_WHEELS = (Override("odometry.prior", "constant-velocity", "doctor"),)
 _FEWEST_MATCHED, _LONGEST_NS = 100, 500_000_000  # points of a scan to align; time between two scans
 
 
@@ -130,6 +134,21 @@ def calibrate(log: Log, config: Config, progress: Progress) -> Calibration:
     if log.odometry_topic:
         _of_wheels(result, log, motions, begin_ns)
     return result
+
+
+def delay_of_wheels(log: Log) -> float:
+    """How late the stamps of the wheels are, by matching windows of a log; 0 where small or not observable."""
+    if not log.odometry_topic:
+        return 0.0
+    config, found = load_settings(log.dimension, overrides=_WITHOUT_WHEELS).config, WheelDelay()
+    for window in log.windows(_AT, min(_WINDOW, log.scan_count)):
+        odometry = Odometry(config, log.stated_mounting, dimension=log.dimension)
+        for scan in window:
+            odometry.process(scan)
+        found.add(odometry.predictor.wheels.delay)
+        if found.is_clear:
+            break
+    return found.seconds
 
 
 class _Collector:
@@ -312,7 +331,9 @@ def _of_wheels(result: Calibration, log: Log, motions: Motions, begin_ns: int) -
         times_s = 1e-9 * (np.array(stamps_ns) - begin_ns)
         found = fit_wheels(motions, times_s, lie.flatten(T) if log.dimension == 3 else T, log.stated_mounting)
     if found is None:
-        result.add(name, "scale of distances", "", 1.0, math.inf, "the log hardly moves")
+        result.add(
+            name, "scale of distances", "", 1.0, math.inf, "the log hardly moves, or wheels and scans contradict"
+        )
         return
     x, s = found.fit.x, found.fit.sigmas
     turns, moves = "the log hardly turns: it only drives straight", "the log hardly moves"

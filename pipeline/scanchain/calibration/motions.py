@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from scanchain import lie
 from scanchain.data import Mask, Matrix, Pose, Vector
+from scanchain.odometry.delay import FEWEST, MOST_DELAY_S, WheelPath, likeliest
 from scanchain.registration.hand_eye import hand_eye, path_m
 
 _STEPS, _STEP = 20, 0.01  # most Gauss-Newton steps; step of a converged parameter, in standard deviations
@@ -18,14 +18,13 @@ _BLOCK = 4  # consecutive motions whose errors may depend on each other
 _KERNEL = 2.0  # normalized residual at which a motion has half its weight
 _DIFFERENCE = 1e-6  # of numerical derivatives
 _MOVING = 0.2  # share of the length of a fast motion below which wheels are taken to stand
-_MOST_DELAY_S, _DELAY_STEP_S = 1.0, 0.02  # of the wheels' stamps against those of the scans, searched at first
 _GYRO_PRIOR = np.array([0.2] * 3 + [0.1] * 3 + [0.2])  # σ of rotation, bias and delay
 _WHEELS_PRIOR = np.array([1.0, 1.0, 0.2, 0.2, 0.2, 0.2, 0.2, 0.05, 0.3])  # of the parameters of ``Wheels``
+_MOST_SYSTEMATIC_S = 0.015  # σ of the delay by the averaging of wheels, at most
+_LARGEST = 0.5  # error of the scale of distances above which wheels and scans are not of one motion
 _CLOCK_S = 0.002  # σ of the instants of poses: scans are deskewed at constant velocity
-_APART_S, _ODDS = 0.1, 10.0  # distinct delays, and least log-likelihood ratio against any other
 # σ that the residuals do not show: angles and scale of the scans' own poses, the clock
 _OF_WHEELS = np.array([0.0, 0.0, 1e-3, 1e-3, 0.0, 0.002, 0.0, 0.0, _CLOCK_S])
-FEWEST = 30  # least number of motions
 
 
 class Motions(NamedTuple):
@@ -118,51 +117,25 @@ class Wheels(NamedTuple):
     fit: Fit
 
 
-class _Base:
-    """Motions of the base by planar poses (M, 3, 3) of wheels, their path averaged over two samples.
-
-    Otherwise delays halfway between samples, where the noise is less, fit better.
-    """
-
-    def __init__(self, times_s: Vector, poses: Matrix) -> None:
-        path = np.column_stack([poses[:, 0, 2], poses[:, 1, 2], np.unwrap(lie.yaw(poses))])
-        self.times_s, self.integral = times_s, cumulative_trapezoid(path, times_s, axis=0, initial=0.0)
-        self.width_s = 2.0 * float(np.median(np.diff(times_s)))
-
-    def over(self, motions: Motions, delay_s: float) -> Matrix:
-        """(M, 3, 3) over each motion, ``delay_s`` later by their stamps."""
-        at = motions.ends_s + delay_s + 0.5 * self.width_s * np.array([-1.0, 1.0])[:, None, None]
-        x, y, yaw = (
-            np.diff(np.interp(at, self.times_s, each), axis=0)[0] / self.width_s for each in self.integral.T
-        )
-        T = lie.exp(np.stack([np.zeros_like(yaw)] * 2 + [yaw], axis=-1))
-        T[..., 0, 2], T[..., 1, 2] = x, y
-        return lie.between(T[:, 0], T[:, 1])
-
-
 def fit_wheels(motions: Motions, times_s: Vector, poses: Matrix, T_base_lidar: Pose | None) -> Wheels | None:
-    """Mounting, scales and delay of wheels from their planar poses (M, 3, 3); None where they hardly move.
+    """Mounting, scales and delay of wheels from their planar poses (M, 3, 3).
 
-    The base is taken to move in its own plane: so a lidar in space shows roll and pitch, too.
+    None where they hardly move or contradict the scans. The base is taken to move in its own plane: so a lidar in
+    space shows roll and pitch, too.
 
     T_base_lidar : as stated; None where the log does not state it: then it is found in closed form
     """
-    base = _Base(times_s, poses)
-    begin_s, end_s = times_s[0] + _MOST_DELAY_S, times_s[-1] - _MOST_DELAY_S
-    motions = motions.where((motions.ends_s[:, 0] > begin_s) & (motions.ends_s[:, 1] < end_s))
+    base = WheelPath(times_s, poses)
+    motions = motions.where(base.covers(motions.ends_s))
     if len(motions.T) < FEWEST:
         return None
-    lengths, turns = path_m(motions.T), lie.log(motions.T)[:, -1]
-    delays_s = np.arange(-_MOST_DELAY_S, _MOST_DELAY_S, _DELAY_STEP_S)
-    odds = np.array([_log_likelihood(base.over(motions, each), lengths, turns) for each in delays_s.tolist()])
-    first_s = float(delays_s[odds.argmax()])
-    is_late = odds.max() - odds[np.abs(delays_s - first_s) > _APART_S].max() > _ODDS  # else any delay fits
-    first_s = first_s if is_late else 0.0
+    lengths, late_s = path_m(motions.T), likeliest(base.odds(*motions))
+    first_s = late_s or 0.0  # where it is None, any delay fits
     motions = motions.where(lengths > max(_MOVING * float(np.quantile(lengths, 0.9)), 1e-3))
     if len(motions.T) < FEWEST:
         return None
     if T_base_lidar is None:
-        moved = base.over(motions, first_s)
+        moved = base.over(motions.ends_s, first_s)
         found = hand_eye(lie.lift(moved) if motions.T.shape[-1] == 4 else moved, motions.T)
         T_base_lidar = lie.identity(motions.T.shape[-1] - 1) if found is None else found.T_base_lidar
     T_first, is_planar = T_base_lidar, len(T_base_lidar) == 3
@@ -178,25 +151,20 @@ def fit_wheels(motions: Motions, times_s: Vector, poses: Matrix, T_base_lidar: P
         by_scans = lie.log(T @ lie.lift(motions.T) @ lie.inverse(T))
         by_scans *= lie.by_component(6, 1.0 + x[5], 1.0 + x[6])
         by_scans[:, 5] += x[7] * by_scans[:, 0]
-        error = lie.log(lie.between(lie.exp(by_scans), lie.lift(base.over(motions, x[8]))))
+        error = lie.log(lie.between(lie.exp(by_scans), lie.lift(base.over(motions.ends_s, x[8]))))
         return error[:, [0, 1, 5]] if is_planar else error
 
     prior = _WHEELS_PRIOR.copy()
     prior[2:4] = 1e-6 if is_planar else prior[2:4]
     first = np.array([0.0] * 8 + [first_s])
     noise, signal = residuals(first)[:, -1], lie.log(motions.T)[:, -1]
-    prior[8] = prior[8] if is_late else 1e-6
+    prior[8] = prior[8] if late_s is not None else 1e-6
     fit = fitted(residuals, first, prior)
+    if abs(fit.x[5]) > _LARGEST:
+        return None
     systematic = _OF_WHEELS.copy()
     systematic[6] += float(np.median(noise**2) / max(np.mean(signal**2), 1e-12))  # attenuation by noise
-    systematic[8] += 0.25 * base.width_s if is_late else _MOST_DELAY_S
+    systematic[8] += MOST_DELAY_S if late_s is None else min(0.25 * base.width_s, _MOST_SYSTEMATIC_S)
     fit = Fit(fit.x, fit.covariance + np.diag(systematic**2))
     T = mounting(fit.x)
     return Wheels(lie.flatten(T) if is_planar else T, fit)
-
-
-def _log_likelihood(base: Matrix, lengths: Vector, turns: Vector) -> float:
-    """Log-likelihood of motions of the wheels, linear in the lengths and in the turns by the scans."""
-    pairs = ((path_m(base), lengths), (np.abs(lie.log(base)[:, -1]), np.abs(turns)))
-    correlations = (float(np.corrcoef(a, b)[0, 1]) for a, b in pairs if np.ptp(a) > 0.0 and np.ptp(b) > 0.0)
-    return sum(-0.5 * len(lengths) * math.log(max(1.0 - max(each, 0.0) ** 2, 1e-9)) for each in correlations)

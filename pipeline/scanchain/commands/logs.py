@@ -99,6 +99,7 @@ def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, .
       scanchain doctor drive.bag --topic /lidar_front/points --json
       scanchain doctor log.mcap --log.point_times ms
     """
+    from scanchain.calibration import delay_of_wheels
     from scanchain.commands.terminal import Terminal
     from scanchain.logs import Log
     from scanchain.logs.doctor import examine
@@ -116,7 +117,7 @@ def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, .
 
     with Terminal("scans") as terminal:
         log_config = load_settings(overrides=overrides).config.log
-        found = examine(logs, config_for, log_config, terminal.count, distortion_of)
+        found = examine(logs, config_for, log_config, terminal.count, distortion_of, delay_of_wheels)
     click.echo(options.json_text(found) if as_json else folded(_doctor_text(found)))
 
 
@@ -211,6 +212,14 @@ def convert(
     type=float,
     metavar="START END METERS",
     help="Let the wheels turn so far ahead between these seconds, and the robot not move by it.",
+)
+@click.option(
+    "--wheels-delay",
+    "wheels_delay_s",
+    default=0.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="How late the stamps of the wheels are.",
 )
 @click.option(
     "--noise",

@@ -80,11 +80,13 @@ def examine(
     log_config: LogConfig,
     progress: Callable[[int, int], None],
     distortion: Callable[[Log], tuple[str, str]] = lambda log: ("", ""),
+    wheel_delay: Callable[[Log], float] = lambda log: 0.0,
 ) -> Diagnosis:
     """Diagnosis from every scan of a log. Raises InputError if a run could not open it either.
 
     config_of : configuration that a run would use for a log of a given dimension
     distortion : distortion of a log's scans by the lidar's motion, as text, and the flags that remove it
+    wheel_delay : how late the stamps of its wheels are, in s
     """
     log = open_log(sources, replace(log_config, max_bad_scans_percent=100.0))
     notes = tuple(log.notes)
@@ -93,6 +95,7 @@ def examine(
         seen.add(scan)
         progress(len(seen.log_times_ns), log.scan_count)
     config = config_of(log.dimension)
+    seen.wheel_delay_s = wheel_delay(log)
     found = list(_check(seen, config, most_bad_scans(seen.messages, log_config)))
     if (measured := distortion(log))[0]:
         effect = "map and trajectory are distorted together, which residuals hardly show" if measured[1] else ""
@@ -121,6 +124,7 @@ class Survey:
         self.log, self.noise = log, RangeNoise()
         self.scans, self.log_times_ns, self.stamps_ns = list[Facts](), list[int](), list[int]()
         self.wheels: list[tuple[int, NDArray[np.float64]]] = []
+        self.wheel_delay_s = 0.0
         self.inertial: list[tuple[NDArray[np.int64], float]] = []  # stamps, and size of the mean specific force
         self.fixes: list[Fixes] = []
 
@@ -231,6 +235,11 @@ def _wheels(seen: Survey) -> Finding:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
         effect = "no vehicle is as fast: millimeters, or jumps? Poses are predicted far from the robot"
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
+    if delay_s := seen.wheel_delay_s:
+        found += f"; its stamps are {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'}"
+        effect = "they predict the motion of another time"
+        fix = f"--log.odometry_delay_s {log.config.odometry_delay_s + delay_s:.2f}"
+        return Finding("wheels", Severity.WARNING, found, effect, fix)
     if missed:
         return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
     if log.stated_mounting is None:

@@ -38,7 +38,7 @@ from scanchain.logs.mounting import (
 from scanchain.logs.opening import index_files
 from scanchain.logs.other_lidars import Together, decoder, other_lidars
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
-from scanchain.logs.samples import HOLD_SCANS, NEAREST_NS, Recorded, ScaledOdometry
+from scanchain.logs.samples import HOLD_SCANS, Recorded, ScaledOdometry
 from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidars
 from scanchain.settings import load_settings, overrides_of
@@ -355,12 +355,12 @@ class Log:
             while waiting and (
                 message is None
                 or len(waiting) > HOLD_SCANS
-                or message.log_time_ns - waiting[0].log_time_ns > NEAREST_NS
+                or message.log_time_ns - waiting[0].log_time_ns > recorded.patience_ns
                 or not isinstance(first := waiting[0].value, Returns)
                 or recorded.covers(first)
             ):
                 scan = waiting.popleft()
-                wheels = recorded.odometry.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+                wheels = recorded.wheels(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
                 yield scan, wheels and scaled.corrected(wheels.T_parent_child)
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:

@@ -20,7 +20,7 @@ from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.logs.mounting import Sensor
 
 _RETAINED = 4096  # samples in memory: of 2 s and more at 2000 Hz
-NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and that a scan waits for it
+NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and, with its delay added, that a scan waits
 HOLD_SCANS = 32  # largest number of scans that wait for samples, or for points of other lidars; limits memory
 
 
@@ -125,6 +125,7 @@ class Recorded:
         """
         topics = odometry_topic, "" if imu is None else imu.topic
         self._delays_ns = {topic: round(1e9 * delay_s) for topic, delay_s in zip(topics, delays_s, strict=True)}
+        self.patience_ns = NEAREST_NS + max(0, round(1e9 * delays_s[0]))  # longest time that a scan waits
         self.odometry, self.imu = SampleStream[StampedPose](), SampleStream[ImuSample]()
         upright = np.diag([1.0, -1.0, -1.0, 1.0]) if is_mirrored else np.eye(4)
         stated = (None if each is None else each.T_lidar_sensor for each in (imu, gnss))
@@ -162,6 +163,11 @@ class Recorded:
             stream.covers(returns.end_ns if stream is self.imu else returns.stamp_ns)
             for stream in self.streams.values()
         )
+
+    def wheels(self, stamp_ns: int) -> StampedPose | None:
+        """The wheel reading at a stamp; if stamps are late, None without a later one, since the last one lags."""
+        is_late = self.patience_ns > NEAREST_NS
+        return None if is_late and not self.odometry.covers(stamp_ns) else self.odometry.at(stamp_ns)
 
     def inertial(self, returns: Returns) -> Inertial | None:
         """Samples of the IMU since those of the scan before, to the first after this one; None without any."""

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.data import BRIDGED_S, Mask, Matrix, Pose, Scan, Vector
 from scanchain.errors import counted
+from scanchain.odometry.delay import correlations
 from scanchain.preprocess import ScanMotion, Sweep, Turning
 
 _SCANS = 200  # motions between scans in memory, from which the model is estimated
@@ -270,12 +271,8 @@ class Gyro:
         steps = round(_MOST_DELAY_S / _DELAY_STEP_S)
         delays_s = _DELAY_STEP_S * np.arange(-steps, steps + 1, dtype=np.float64)
         X, known = measured(delays_s)
-        angles, weights = np.linalg.norm(X, axis=2), known / np.maximum(known.sum(axis=1), 1)[:, None]
-        a = angles - np.sum(weights * angles, axis=1, keepdims=True)
-        b = np.linalg.norm(rotations, axis=1) - weights @ np.linalg.norm(rotations, axis=1)[:, None]
-        squares = np.sum(weights * a * a, axis=1) * np.sum(weights * b * b, axis=1)
-        correlation = np.sum(weights * a * b, axis=1) / np.sqrt(np.maximum(squares, 1e-24))
-        return float(delays_s[np.argmax(np.where(2 * known.sum(axis=1) >= len(rotations), correlation, -1.0))])
+        found = correlations(np.linalg.norm(X, axis=2), np.linalg.norm(rotations, axis=1), known)
+        return float(delays_s[found.argmax()])
 
 
 def _interpolated(at_s: Vector, times_s: Vector, values: Matrix) -> Matrix:

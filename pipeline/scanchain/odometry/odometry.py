@@ -187,7 +187,7 @@ class Odometry:
         )
         tracked = self._at_stamp(tracked, sweep, prediction)
         is_open = tracked.state is not State.OK
-        self.predictor.wheels.mounting.update(tracked.T_odom_lidar, tracked.scan.T_odom_base, is_open=is_open)
+        self.predictor.wheels.update(tracked.scan, tracked.T_odom_lidar, tracked.match, is_open=is_open)
         return tracked
 
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:

@@ -228,7 +228,8 @@ class Predictor:
         if wheel is not None:
             motion, covariance = wheel, self.wheels.statistics.covariance
             scans = max(interval_s / times.usual_s, 1.0) if times.usual_s else 1.0
-            if largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
+            is_second = times.last_s == 0.0  # no motion is known that a jump would contradict
+            if not is_second and largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
                 jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
         elif turning is not None and self.accelerometer.is_used:
             source, motion, covariance = Source.IMU, *self._by_imu()
@@ -297,7 +298,8 @@ class Predictor:
 
     def notes(self) -> tuple[str, ...]:
         """Notes on wheels and IMU, one per line."""
-        return tuple(filter(None, (self.wheels.mounting.finish(), self.gyro.note(), self.accelerometer.note())))
+        by_wheels = self.wheels.mounting.finish(), self.wheels.note()
+        return tuple(filter(None, (*by_wheels, self.gyro.note(), self.accelerometer.note())))
 
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Update by the pose of a scan: that of its match or, if lost, the predicted one."""

@@ -6,10 +6,16 @@ import math
 
 from scanchain import lie
 from scanchain.config import OdometryConfig
-from scanchain.data import Pose, Scan
+from scanchain.data import Match, Pose, Scan
 from scanchain.errors import InputError, counted
+from scanchain.kernels.registration.observability import WEAK
+from scanchain.odometry.delay import WheelDelay
 from scanchain.odometry.motion_filter import ErrorStatistics
 from scanchain.registration.hand_eye import MountingEstimator
+
+_ASSUMED_M = 2.0  # of path on which distances by wheels and by scans are taken to be equal, at first
+_LEAST_PERCENT = 0.1  # error of distances by wheels that is reported
+_SLIP, _SLIP_M = 0.06, 0.02  # share of a motion, and distance, by which wheels and scans differ that do not slip
 
 
 class Wheels:
@@ -18,6 +24,8 @@ class Wheels:
     statistics : of its prediction errors
     is_contradicted : whether the reading at the newest scan is rejected
     innovation : of the motion to the newest scan, normalized; NaN where it is not compared
+    delay : of its stamps
+    by_scans_m, by_wheels_m : path where both are known, in space
     """
 
     def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
@@ -27,8 +35,15 @@ class Wheels:
         sigma = lie.by_component(lie.twist_size(T_base_lidar), config.wheel_sigma_m, config.wheel_sigma_rad)
         self.statistics = ErrorStatistics(sigma)
         self.is_contradicted, self.innovation = False, math.nan
+        self.delay, self.by_scans_m, self.by_wheels_m = WheelDelay(), _ASSUMED_M, _ASSUMED_M
+        self._last: tuple[Pose, Pose] | None = None  # poses of lidar and base at the last scan if it is determined
         self._T_odom_base: Pose | None = None  # at the last scan; None where rejected
         self._jumps: list[tuple[int, float]] = []  # scan number and meters of each rejected reading
+
+    @property
+    def scale(self) -> float:
+        """True distances over those by the wheels."""
+        return self.by_scans_m / self.by_wheels_m
 
     def motion(self, scan: Scan) -> Pose | None:
         """T_previous_current of a scan after the first; None without a reading at both ends.
@@ -45,8 +60,9 @@ class Wheels:
             )
         if last is None or now is None or not self.mounting.is_usable:
             return None
-        T_base_lidar = self.mounting.T_base_lidar
-        return lie.between(T_base_lidar, lie.between(last, now).dot(T_base_lidar))
+        T_base_lidar, moved = self.mounting.T_base_lidar, lie.between(last, now)
+        moved[:-1, -1] *= self.scale
+        return lie.between(T_base_lidar, moved.dot(T_base_lidar))
 
     def reject(self, scan: Scan, jump_m: float) -> None:
         """Reject the reading at this scan, which jumps by ``jump_m``, also for the motion to the next scan."""
@@ -58,12 +74,46 @@ class Wheels:
         reading = None if self.is_contradicted else scan.T_odom_base
         self._T_odom_base = None if reading is None else reading.copy()
 
+    def update(self, scan: Scan, T_odom_lidar: Pose, match: Match, *, is_open: bool) -> None:
+        """Estimate mounting, delay and scale by the pose of a scan at its stamp; ``is_open`` if undetermined."""
+        self.mounting.update(T_odom_lidar, scan.T_odom_base, is_open=is_open)
+        before, self._last = self._last, None
+        if scan.T_odom_base is None:
+            return
+        known = T_odom_lidar, scan.T_odom_base.copy()
+        self.delay.update(scan.stamp_ns, *known, is_known=not is_open)
+        if len(T_odom_lidar) == 3 or is_open or match.observability < WEAK:  # the prediction is in the pose
+            return
+        self._last = known
+        if before is not None and self.mounting.is_usable:
+            self._update_scale(*map(lie.between, before, known))
+
+    def _update_scale(self, lidar: Pose, base: Pose) -> None:
+        """Add the distances of a motion by scans and by wheels, unless they contradict each other."""
+        T_base_lidar, by_wheels_m = self.mounting.T_base_lidar, float(base[0, 3])
+        by_scans_m = float((T_base_lidar @ lidar @ lie.inverse(T_base_lidar))[0, 3])
+        if abs(by_scans_m - self.scale * by_wheels_m) < _SLIP * abs(by_wheels_m) + _SLIP_M:
+            self.by_scans_m += abs(by_scans_m)
+            self.by_wheels_m += abs(by_wheels_m)
+
+    def note(self) -> str:
+        """Error of its distances, in words; empty where none is known."""
+        percent = 100.0 * (1.0 / self.scale - 1.0)
+        if abs(percent) < _LEAST_PERCENT:
+            return ""
+        long = "long" if percent > 0.0 else "short"
+        return f"wheel odometry: its distances are {abs(percent):.1f} % too {long}, which predictions correct"
+
     def warnings(self) -> tuple[str, ...]:
-        """A line on readings that were rejected; none without any."""
-        if not self._jumps:
-            return ()
-        longest_m = max(jump_m for _, jump_m in self._jumps)
-        return (
-            f"wheel odometry jumps by up to {longest_m:.3g} m where the scans fit without it: left out "
-            f"at {counted(len(self._jumps), 'scan')} (the first: scan {self._jumps[0][0]:,})",
-        )
+        """Late stamps, and readings that were rejected, one per line."""
+        lines, delay_s = list[str](), self.delay.seconds
+        if delay_s:
+            late = f"{abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'}"
+            lines.append(f"wheel odometry: its stamps are {late}: add {delay_s:.2f} to log.odometry_delay_s")
+        if self._jumps:
+            longest_m = max(jump_m for _, jump_m in self._jumps)
+            lines.append(
+                f"wheel odometry jumps by up to {longest_m:.3g} m where the scans fit without it: left out "
+                f"at {counted(len(self._jumps), 'scan')} (the first: scan {self._jumps[0][0]:,})"
+            )
+        return tuple(lines)

@@ -66,6 +66,7 @@ class Drive:
     scans : (K,) int64, numbers of the recorded scans, counted from the start; the others fall into dropouts
     seed, changed : of all random numbers; ``changed`` is None on the first day
     drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
+    wheels_delay_s : how late its stamps are
     solids_of_instant : the solids at the start of a scan, if some of them move
     changes : of the world since the drive of the same seed on the first day
     imu, gnss : None if the vehicle has none
@@ -80,6 +81,7 @@ class Drive:
     changed: int | None = None
     drift: float = 1.0
     wheels_slip: Slip = NO_SLIP
+    wheels_delay_s: float = 0.0
     solids_of_instant: Callable[[float], Solids] | None = None
     changes: tuple[Change, ...] = ()
     imu: ImuModel | None = None
@@ -103,6 +105,7 @@ def plan(
     dropout: float | None = None,
     drift: float = 1.0,
     wheels_slip: Slip = NO_SLIP,
+    wheels_delay_s: float = 0.0,
     reverse: bool = False,
     start_m: float = 0.0,
     pace: float = 1.0,
@@ -124,6 +127,7 @@ def plan(
     _check_range("start_m", start_m, 0.0, checks.LARGEST)
     _check_range("drift", drift, 0.0, 100.0)
     _check_range("pace", pace, 0.1, 10.0)
+    _check_range("wheels_delay_s", wheels_delay_s, -10.0, 10.0)
     start_s, end_s, size_m = wheels_slip
     if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
         raise InputError(
@@ -150,7 +154,8 @@ def plan(
     scans = _recorded(scene, motion, lidar, count)
     return Drive(
         solids, motion, lidar, scene.vehicle.T_base_lidar, scans, seed, changed, drift, wheels_slip,
-        changes=changes, imu=None if imu is None else IMUS[imu], gnss=None if gnss is None else RECEIVERS[gnss],
+        wheels_delay_s, changes=changes, imu=None if imu is None else IMUS[imu],
+        gnss=None if gnss is None else RECEIVERS[gnss],
     )  # fmt: skip
 
 
@@ -219,8 +224,9 @@ def simulate(
     progress : called with the number of scans done and the total
     options : ``seed``, 0 by default; ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in
         place of the sensor's own; ``drift``, which multiplies the errors of the wheel odometry, and
-        ``wheels_slip``, by which it slips once; ``imu`` and ``gnss``, by name; ``pace``, a factor on the
-        speed of the drive; ``reverse`` to drive in the opposite direction, from ``start_m`` along that route;
+        ``wheels_slip``, by which it slips once; ``wheels_delay_s``, by which its stamps are late; ``imu`` and
+        ``gnss``, by name; ``pace``, a factor on the speed of the drive; ``reverse`` to drive in the opposite
+        direction, from ``start_m`` along that route;
         ``changed``, a seed, for another day: furniture or parked cars appeared, vanished or moved, as listed in
         .changes.csv next to the log, and the drive is repeated with other deviations and noise
 
@@ -315,7 +321,7 @@ class _OtherSensors:
 
 def _wheels(drive: Drive, last_ns: int) -> Iterator[_Message]:
     stamps_ns = np.arange(EPOCH_NS, last_ns + 1, _ODOMETRY_PERIOD_NS)
-    times_s = (stamps_ns - EPOCH_NS) * 1e-9
+    times_s = (stamps_ns - EPOCH_NS) * 1e-9 - drive.wheels_delay_s
     begin_s, end_s, size_m = drive.wheels_slip
     slips_m = np.diff(size_m * np.clip((times_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
     poses, rng = drive.motion.base(times_s), _random(drive.seed, _WHEELS, drive.changed)
