@@ -77,7 +77,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     range_offset_m : length that is added to its ranges
     imu_rotation : rotation of the IMU in the lidar's frame, ``qx qy qz qw``; by the transforms where empty
     imu_delay_s : how late the stamps of the IMU are
-    odometry_delay_s : how late the stamps of the wheel odometry are
+    odometry_delay_s : how late the stamps of the wheel odometry are, as ``scanchain doctor`` finds it
     odometry_scale : distances by the wheels over true ones; they are divided by it
     odometry_turn_scale : turns by the wheels over true ones
     upside_down : whether a planar lidar hangs upside down although no transform says so: its scans are mirrored

@@ -89,11 +89,12 @@ class Wheels:
             self._update_scale(*map(lie.between, before, known))
 
     def _update_scale(self, lidar: Pose, base: Pose) -> None:
-        """Add the distances of a motion by scans and by wheels, unless they contradict each other."""
+        """Add the distances of a motion by scans and by wheels, unless they contradict each other or are short."""
         T_base_lidar, by_wheels_m = self.mounting.T_base_lidar, float(base[0, 3])
         by_scans_m = float((T_base_lidar @ lidar @ lie.inverse(T_base_lidar))[0, 3])
-        if abs(by_scans_m - self.scale * by_wheels_m) < _SLIP * abs(by_wheels_m) + _SLIP_M:
-            self.by_scans_m += abs(by_scans_m)
+        is_likely = abs(by_scans_m - self.scale * by_wheels_m) < _SLIP * abs(by_wheels_m) + _SLIP_M
+        if is_likely and abs(by_wheels_m) > _SLIP_M:
+            self.by_scans_m += math.copysign(1.0, by_wheels_m) * by_scans_m
             self.by_wheels_m += abs(by_wheels_m)
 
     def note(self) -> str:
