@@ -101,6 +101,13 @@ def test_in_space_distances_by_wheels_are_corrected_by_those_of_the_scans_but_no
     assert wheels_of(3, np.eye(4)).note() == ""
 
 
+def test_the_distances_of_late_wheels_are_not_corrected():
+    wheels = tracked_by(Drive.of(made.log("town", seconds=12, sensor="vlp-16", wheels_delay_s=-0.3))).wheels
+    assert wheels.by_scans_m < 0.98 * wheels.by_wheels_m
+    assert wheels.scale == 1.0 and wheels.note() == ""
+    assert "its stamps are 0.30 s early" in wheels.warnings()[0]
+
+
 def test_wheels_that_differ_from_the_scans_by_more_than_slip_change_no_scale_and_in_the_plane_none_is_estimated():
     for dimension, factor, scale in ((3, 1.05, 1.0 / 1.05), (3, 1.3, 1.0), (2, 1.05, 1.0)):
         wheels, T = wheels_of(dimension, lie.identity(dimension)), lie.identity(dimension)

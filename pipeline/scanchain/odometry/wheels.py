@@ -14,6 +14,7 @@ from scanchain.odometry.motion_filter import ErrorStatistics
 from scanchain.registration.hand_eye import MountingEstimator
 
 _ASSUMED_M = 2.0  # of path on which distances by wheels and by scans are taken to be equal, at first
+_CHECKED = 100  # readings after which it is checked again whether stamps are late
 _LEAST_PERCENT = 0.1  # error of distances by wheels that is reported
 _SLIP, _SLIP_M = 0.06, 0.02  # share of a motion, and distance, by which wheels and scans differ that do not slip
 
@@ -26,6 +27,7 @@ class Wheels:
     innovation : of the motion to the newest scan, normalized; NaN where it is not compared
     delay : of its stamps
     by_scans_m, by_wheels_m : path where both are known, in space
+    is_late : whether its stamps are out of step, in space; readings : number of them
     """
 
     def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
@@ -36,14 +38,15 @@ class Wheels:
         self.statistics = ErrorStatistics(sigma)
         self.is_contradicted, self.innovation = False, math.nan
         self.delay, self.by_scans_m, self.by_wheels_m = WheelDelay(), _ASSUMED_M, _ASSUMED_M
+        self.is_late, self.readings = False, 0
         self._last: tuple[Pose, Pose] | None = None  # poses of lidar and base at the last scan if it is determined
         self._T_odom_base: Pose | None = None  # at the last scan; None where rejected
         self._jumps: list[tuple[int, float]] = []  # scan number and meters of each rejected reading
 
     @property
     def scale(self) -> float:
-        """True distances over those by the wheels."""
-        return self.by_scans_m / self.by_wheels_m
+        """True distances over those by the wheels; 1 if late, as accelerations then look like a wrong scale."""
+        return 1.0 if self.is_late else self.by_scans_m / self.by_wheels_m
 
     def motion(self, scan: Scan) -> Pose | None:
         """T_previous_current of a scan after the first; None without a reading at both ends.
@@ -82,7 +85,12 @@ class Wheels:
             return
         known = T_odom_lidar, scan.T_odom_base.copy()
         self.delay.update(scan.stamp_ns, *known, is_known=not is_open)
-        if len(T_odom_lidar) == 3 or is_open or match.observability < WEAK:  # the prediction is in the pose
+        if len(T_odom_lidar) == 3:
+            return
+        self.readings += 1
+        if self.readings % _CHECKED == 0:
+            self.is_late = self.delay.seconds != 0.0
+        if is_open or match.observability < WEAK:  # the prediction is in the pose
             return
         self._last = known
         if before is not None and self.mounting.is_usable:
