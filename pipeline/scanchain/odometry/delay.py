@@ -7,7 +7,6 @@ from scipy.integrate import cumulative_trapezoid
 
 from scanchain import lie
 from scanchain.data import Mask, Matrix, Pose, Vector
-from scanchain.registration.hand_eye import path_m
 
 _DELAYS_S = np.linspace(-1.0, 1.0, 101)  # of the wheels' stamps against those of the scans
 MOST_DELAY_S = float(_DELAYS_S[-1])
@@ -57,17 +56,17 @@ class WheelPath:
 
     def odds(self, ends_s: Matrix, motions: Matrix) -> Vector:
         """Log-likelihood of each delay, if lengths and turns are linear in those of the scans (M, d+1, d+1)."""
-        at_delays = [self.over(ends_s, delay_s) for delay_s in _DELAYS_S.tolist()]
-        known, total = np.ones((len(_DELAYS_S), len(motions)), bool), np.zeros(len(_DELAYS_S))
-        for size in (path_m, _turns):
-            found = correlations(np.array([size(each) for each in at_delays]), size(motions), known)
+        after_s = _DELAYS_S[:, None, None, None] + 0.5 * self.width_s * np.array([-1.0, 1.0])  # (D, 1, 1, 2)
+        ends = (
+            np.diff(np.interp(ends_s[..., None] + after_s, self.times_s, each))[..., 0] for each in self.integral.T
+        )
+        x, y, turns = (np.diff(each / self.width_s)[..., 0] for each in ends)  # (D, M)
+        known, total = np.ones(turns.shape, bool), np.zeros(len(_DELAYS_S))
+        of_scans = np.linalg.norm(motions[:, :-1, -1], axis=1), np.abs(lie.log(motions)[:, -1])
+        for measured, by_scans in zip((np.hypot(x, y), np.abs(turns)), of_scans, strict=True):
+            found = correlations(measured, by_scans, known)
             total -= 0.5 * len(motions) * np.log(np.maximum(1.0 - np.maximum(found, 0.0) ** 2, 1e-9))
         return total
-
-
-def _turns(motions: Matrix) -> Vector:
-    """Angles (M,) about the upward axis."""
-    return np.abs(lie.log(motions)[:, -1])
 
 
 def likeliest(odds: Vector) -> float | None:
@@ -78,26 +77,26 @@ def likeliest(odds: Vector) -> float | None:
 
 
 class WheelDelay:
-    """How late the stamps of wheels are, from lengths and turns of the motions between scans, block by block."""
+    """How late the stamps of wheels are, from lengths and turns of the motions between scans, block by block.
+
+    is_clear : whether a delay is likelier than any distinct one by far; then nothing is added
+    """
 
     def __init__(self) -> None:
-        self.odds = np.zeros(len(_DELAYS_S))
+        self.odds, self.is_clear = np.zeros(len(_DELAYS_S)), False
         self.block: list[tuple[float, Pose, Pose, bool]] = []
 
     def update(self, stamp_ns: int, T_odom_lidar: Pose, T_odom_base: Pose, *, is_known: bool) -> None:
         """Add the poses of a scan by scans and wheels; ``is_known`` if the former is determined."""
+        if self.is_clear:
+            return
         if len(self.block) == _BLOCK or (self.block and abs(1e-9 * stamp_ns - self.block[-1][0]) > MOST_DELAY_S):
-            self.odds, self.block = self.odds + self._of_block(), []
+            self._set(self.total)
         self.block.append((1e-9 * stamp_ns, T_odom_lidar, T_odom_base, is_known))
 
     def add(self, other: WheelDelay) -> None:
         """Add what another part of the log shows."""
-        self.odds = self.odds + other.total
-
-    @property
-    def is_clear(self) -> bool:
-        """True if a delay is likelier than any distinct one by far."""
-        return likeliest(0.5 * self.total) is not None
+        self._set(self.odds + other.total)
 
     @property
     def seconds(self) -> float:
@@ -109,6 +108,9 @@ class WheelDelay:
     def total(self) -> Vector:
         """Log-likelihood (D,) of each delay."""
         return self.odds + self._of_block()
+
+    def _set(self, odds: Vector) -> None:
+        self.odds, self.block, self.is_clear = odds, [], likeliest(0.5 * odds) is not None
 
     def _of_block(self) -> Vector:
         if len(self.block) < FEWEST:
