@@ -87,7 +87,7 @@ def test_the_kernel_equals_the_naive_ray_caster(seed, ground):
     assert np.allclose(fast, naive, atol=1e-7, rtol=0.0)
 
 
-@pytest.mark.parametrize("name", [name for name in WORLDS if name not in ("staircase", "gap")])
+@pytest.mark.parametrize("name", [name for name in WORLDS if name not in ("staircase", "garage", "gap")])
 @pytest.mark.parametrize("seed", range(2))
 def test_the_path_crosses_no_wall_and_no_furniture(name, seed):
     drive = plan(name, seed=seed, duration_s=120.0)
@@ -180,6 +180,21 @@ def test_at_another_pace_the_same_poses_are_passed_sooner():
     rate = np.rad2deg(lie.wrap(np.diff(lie.yaw(sooner))) / 0.01)
     assert np.abs(rate).max() == pytest.approx(200.0, abs=2.0)
     assert len(fast.scans) == len(usual.scans)
+
+
+def test_the_car_of_the_garage_stands_on_two_floors_and_pitches_on_the_ramp_between():
+    drive = planned("garage", "vlp-16")
+    poses = drive.motion.base(np.arange(0.0, 90.0, 0.2))
+    above = poses.copy()
+    above[:, :3, :3], above[:, 2, 3] = np.eye(3), poses[:, 2, 3] + 1.0
+    down = np.tile([0.0, 0.0, -1.0], (len(poses), 1))
+    below_m = drive.solids.cast(above, np.arange(len(poses), dtype=np.int32), down, 5.0)
+    np.testing.assert_allclose(below_m, 1.0, atol=0.15)  # bends are rounded over 3 m
+    heights_m, slopes = poses[:, 2, 3], poses[:, 2, 0]
+    assert (np.abs(heights_m) < 0.02).mean() > 0.3 and (np.abs(heights_m - 3.3) < 0.02).mean() > 0.3
+    assert slopes.max() > 0.9 * 3.3 / 36.0 and slopes.min() < -0.9 * 3.3 / 36.0
+    walls = drive.solids.part(drive.solids.rows[:, 4] > 10.0)
+    assert walls.part(walls.rows[:, 3] < 1.0).clearance_m(poses[:, :2, 3], below_m=2.0).min() > 1.0
 
 
 def test_the_staircase_is_climbed_with_a_swaying_hand():

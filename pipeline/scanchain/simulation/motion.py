@@ -37,6 +37,7 @@ class Vehicle:
     sway_rad, heave_m : roll, pitch and height of the body at full speed, amplitudes
     swing_rad, swing_m : heading and sideways motion of the body at full speed, amplitudes
     start_m_s : speed at the first instant
+    pitches : whether it pitches with the heights of its route
     standstill_s : how long it stands still before it starts
     """
 
@@ -52,6 +53,7 @@ class Vehicle:
     swing_rad: float = 0.0
     swing_m: float = 0.0
     start_m_s: float = 0.0
+    pitches: bool = False
     standstill_s: float = 0.0
 
 
@@ -66,6 +68,7 @@ class Course(NamedTuple):
     place: Matrix
     forward: Matrix
     speed_m_s: NDArray[np.float64]
+    climb: NDArray[np.float64] | float = 0.0  # slope (N,) of the vehicle at given heights
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +85,11 @@ class Motion:
 
     def base(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_base at (N,) instants, (N, 4, 4): x along the path, z normal to the ground."""
-        place, forward, speed_m_s = self.course(times_s)
+        place, forward, speed_m_s, climb = self.course(times_s)
         if place.shape[1] == 2:
             height_m, slope = self.solids.ground_height(place), self.solids.ground_slope(place)
         else:
-            height_m, slope = place[:, 2], np.zeros_like(forward)
+            height_m, slope = place[:, 2], np.reshape(climb, (-1, 1)) * forward
         poses = _stand(place[:, :2], height_m, slope, forward)
         v = self.vehicle
         if v.sway_rad > 0.0 or v.heave_m > 0.0:  # sway of a body on springs or legs, proportional to its speed
@@ -101,8 +104,8 @@ class Motion:
         """The same course, driven ``pace`` times as fast."""
 
         def course(times_s: NDArray[np.floating]) -> Course:
-            place, forward, speed_m_s = self.course(pace * times_s)
-            return Course(place, forward, pace * speed_m_s)
+            course = self.course(pace * times_s)
+            return course._replace(speed_m_s=pace * course.speed_m_s)
 
         return replace(self, course=course, vehicle=replace(self.vehicle, speed_m_s=pace * self.vehicle.speed_m_s))
 
@@ -201,7 +204,7 @@ class Lap:
 def laps(
     route: Matrix, vehicle: Vehicle, solids: Solids, *, duration_s: float, rng: np.random.Generator
 ) -> Motion:
-    """A drive around a closed ``route``: (W, 2) along the ground, (W, 3) walked upright at its heights."""
+    """A drive around a closed ``route``: (W, 2) along the ground, (W, 3) at its heights."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     reach_m = vehicle.speed_m_s * duration_s + 10.0 * vehicle.corner_m + 2.0 * _MARGIN_S * vehicle.start_m_s
     line = _deviate(Lap(route).at(np.arange(0.0, reach_m, 0.02 * vehicle.corner_m)), vehicle, rng)
@@ -213,9 +216,10 @@ def laps(
 
     def course(times_s: NDArray[np.floating]) -> Course:
         along_m = driven_m(times_s)
-        forward = position(along_m, 1)[:, :2]
-        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        return Course(position(along_m), forward, driven_m(times_s, 1))
+        ahead = position(along_m, 1)
+        ahead /= np.linalg.norm(ahead[:, :2], axis=1, keepdims=True)
+        climb = ahead[:, 2] if vehicle.pitches else 0.0
+        return Course(position(along_m), ahead[:, :2], driven_m(times_s, 1), climb)
 
     return Motion(course, vehicle, solids, phases)
 

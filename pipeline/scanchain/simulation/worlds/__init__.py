@@ -45,6 +45,7 @@ WORLDS: dict[str, World] = {
     "forest": World(outdoor.forest, outdoor.FOREST_ROUTE, outdoor.MULE, "os1-32", 30.0),
     "staircase": World(indoor.staircase, indoor.STAIRCASE_ROUTE, indoor.WALKER, "os1-32", 40.0),
     "hall": World(indoor.hall, indoor.HALL_ROUTE, indoor.TRUCK, "vlp-16", 25.0),
+    "garage": World(indoor.garage, indoor.GARAGE_ROUTE, indoor.GARAGE_CAR, "vlp-16", 90.0),
     "turns": World(outdoor.yard, outdoor.YARD_STEPS, outdoor.YARD_ROBOT, "os1-32", 40.0),
     "gap": World(  # at a crossing where the car turns, and in the middle of a street
         outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 30.0, dropouts=((0.0, 40.0), (25.0, 0.0))

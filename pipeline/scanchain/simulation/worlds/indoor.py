@@ -1,9 +1,9 @@
-"""Worlds inside of buildings: an office, an identical floor, a corridor, a hall, a stairwell.
+"""Worlds inside of buildings: an office, an identical floor, a corridor, a hall, a garage, a stairwell.
 
 The office has rooms along a corridor that runs in a ring around a core; the identical floor has three corridors of
 identical rooms, which are perceptually aliased. The corridor is 80 m long with bare walls between two lobbies: in
-its middle the motion along it is unobservable. The hall is large, with few pillars; the stairwell has four storys
-and is walked up and down with a handheld lidar.
+its middle the motion along it is unobservable. The hall is large, with few pillars; the garage has two floors and
+a ramp; the stairwell has four storys and is walked up and down with a handheld lidar.
 """
 
 from __future__ import annotations
@@ -349,6 +349,48 @@ def hall(rng: np.random.Generator) -> Solids:
     for x in rng.uniform([3.0, 22.0, 36.0, 54.0], [6.0, 27.0, 40.0, 57.0]):
         y = float(rng.choice([1.0, width - 1.0]))
         scenery.box((float(x), y), (rng.uniform(1.2, 3.6), 1.2), (0.0, rng.uniform(0.6, 2.2)))
+    return scenery.finish()
+
+
+# the garage
+
+_DECK = Room(60.0, 40.0, 3.0, 0.3)  # a story and the slab above it
+_RAMP_M, _SLAB_M = (10.0, 46.0, 6.0), 0.4  # foot, head and width of the ramp, depth of the slabs it is made of
+
+GARAGE_CAR = Vehicle(
+    speed_m_s=5.0, acceleration_m_s2=2.0, lateral_acceleration_m_s2=3.0, corner_m=3.0, deviation_m=0.2,
+    sway_rad=0.004, heave_m=0.01, radius_m=0.9, T_base_lidar=mount(0.8, 1.73), pitches=True,
+)  # fmt: skip
+
+# Around the ground floor, up the ramp along its south side, around the upper floor, and down again.
+GARAGE_ROUTE = np.array([
+    [4.0, 6.0, 0.0], [54.0, 6.0, 0.0], [54.0, 34.0, 0.0], [4.0, 34.0, 0.0], [4.0, -3.0, 0.0], [10.0, -3.0, 0.0],
+    [46.0, -3.0, 3.3], [54.0, -3.0, 3.3], [54.0, 34.0, 3.3], [6.0, 34.0, 3.3], [6.0, 6.0, 3.3], [54.0, 6.0, 3.3],
+    [54.0, -3.0, 3.3], [46.0, -3.0, 3.3], [10.0, -3.0, 0.0], [4.0, -3.0, 0.0],
+])  # fmt: skip
+
+
+def garage(rng: np.random.Generator) -> Solids:
+    """Two floors of pillars and cars, sampled from ``rng``, and a ramp of slabs between them, all behind walls."""
+    scenery, (length, width, height, slab), (foot, head, depth) = Scenery(), _DECK, _RAMP_M
+    story, middle, ramp = height + slab, 0.5 * length, 0.5 * (foot + head)
+    for x, y, along, across, low, top in (
+        (middle, 0.5 * width, length, width, height, story),
+        (middle, 17.0, length, 46.0, story + height, 2 * story),
+        (0.5 * (head + length), -0.5 * depth, length - head, depth, height, story),
+        (0.0, 17.0, slab, 46.0, 0.0, 2 * story), (length, 17.0, slab, 46.0, 0.0, 2 * story),
+        (middle, -depth, length, slab, 0.0, 2 * story), (middle, width, length, slab, 0.0, 2 * story),
+        (ramp, 0.0, head - foot, slab, 0.0, 2 * story),
+    ):  # fmt: skip
+        scenery.box((x, y), (along, across), (low, top))
+    for x in np.arange(foot + 0.5 * _SLAB_M, head, _SLAB_M):
+        top = story * (x - foot) / (head - foot)
+        scenery.box((x, -0.5 * depth), (_SLAB_M, depth), (top - slab, top))
+    for x, y, low in product(np.arange(12.0, 48.0, 9.0), (14.0, 26.0), (0.0, story)):
+        x += rng.uniform(-3.0, 3.0)  # the floors are not alike
+        scenery.box((x, y), (0.5, 0.5), (low, low + height))
+        car = rng.uniform([2.5, -3.0, 1.4], [3.5, 3.0, 2.0])
+        scenery.box((x + car[0], y + car[1]), (1.8, 4.5), (low + 0.3, low + car[2]))
     return scenery.finish()
 
 
