@@ -285,6 +285,8 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     robust_scale : normalized error above which the loss downweights an edge, in standard deviations
     gnss : use of the fixes of a GNSS receiver: ``constrain`` corrects drift of the trajectory that they show,
         ``datum`` only gives the result its place on Earth
+    ground : prior that the vehicle moves in planes, where the lidar does not contradict it: ``auto`` in 3D logs
+        with wheel odometry, ``on`` in others, too
     """
 
     optimizer: Literal["levenberg-marquardt", "gauss-newton", "gradient-descent"] = "levenberg-marquardt"
@@ -293,6 +295,7 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     robust: Loss = "truncated"
     robust_scale: Positive = 3.0
     gnss: Literal["constrain", "datum"] = "constrain"
+    ground: Literal["auto", "on", "off"] = "auto"
 
 
 class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):

@@ -29,6 +29,7 @@ from scanchain.data import (
     Step,
     Timing,
     Trajectory,
+    Vector,
     brief,
 )
 from scanchain.errors import InputError, counted
@@ -36,6 +37,7 @@ from scanchain.georeference import Georeference, Georeferencing
 from scanchain.graph.factors import Odometry
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.gravity import leveled
+from scanchain.ground import flattened
 from scanchain.growing_array import GrowingArray
 from scanchain.loops import ClosureTable, refined, spread
 from scanchain.maps import SavedMap
@@ -207,13 +209,12 @@ class Slam:
         state, first = back_end.finish(progress), back_end.first
         scan_of = np.array([keyframe.scan_index for keyframe in self.keyframes[first:]])
         starts = [start - first for start in back_end.closer.segments.starts]
-        components, graph = back_end.closer.segments.components(back_end.graph), back_end.graph
-        up, by_gravity = lie.lift(self.T_base_lidar)[2, :3], ""
-        if self.at_rest and not first:
-            graph, by_gravity = leveled(graph, self.at_rest, self.config.graph)
-            state, up = graph.state(), np.array([0.0, 0.0, 1.0])
+        components = back_end.closer.segments.components(back_end.graph)
+        graph, up, by_sensors = self._leveled(progress)
+        if graph is not back_end.graph:
+            state = graph.state()
         corrected = spread(state.poses[first:], scan_of, odometry.poses, starts)
-        if by_gravity:
+        if graph is not back_end.graph:
             from_first = lie.between(odometry.poses[0], odometry.poses)
             odometry = Trajectory(odometry.stamps_ns, corrected[0] @ from_first)
         located = Georeferencing(self.fixes, up, self.config.graph) if self.fixes else None
@@ -229,7 +230,8 @@ class Slam:
             world = (fixed, state.poses[:first]) if fixed else (self.keyframes, poses)
             corrected = refined(corrected, self._points_of, *world, self.config)
         tracking, placement = self.front_end.odometry, back_end.placement
-        trajectory, notes = Trajectory(odometry.stamps_ns, corrected), (*tracking.predictor.notes(), by_gravity)
+        trajectory = Trajectory(odometry.stamps_ns, corrected)
+        notes = (*tracking.predictor.notes(), *by_sensors)
         georeference = located and located.place(trajectory)
         if georeference is not None:
             self.steps.compare("GNSS", georeference.stamps_ns, georeference.innovations)
@@ -258,6 +260,21 @@ class Slam:
             georeference=georeference,
             noise=tracking.resolution.noise,
         )
+
+    def _leveled(self, progress: Callable[[str], None]) -> tuple[PoseGraph, Vector, list[str]]:
+        """The graph corrected by gravity and by the ground, the upward direction (3,) in its world, and notes."""
+        graph, up = self.back_end.graph, lie.lift(self.T_base_lidar)[2, :3]
+        by_gravity, by_ground, use = "", "", self.config.graph.ground
+        if self.at_rest and not self.back_end.first:
+            graph, by_gravity = leveled(graph, self.at_rest, self.config.graph)
+        on_wheels = use == "on" or (use == "auto" and bool(self.steps.columns["has_wheels"].any()))
+        alone = not self.back_end.first and len(self.back_end.closer.segments.starts) == 1
+        if on_wheels and alone and self.dimension == 3:
+            progress("testing whether the ground is flat")
+            graph, by_ground = flattened(graph, self.back_end.errors, up, self.config, levels=not by_gravity)
+        if graph is not self.back_end.graph:
+            up = np.array([0.0, 0.0, 1.0]) if by_gravity else graph.poses[0, :3, :3] @ up
+        return graph, up, [by_gravity, by_ground]
 
     def _check_unfinished(self) -> None:
         if self.is_finished:

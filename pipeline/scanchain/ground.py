@@ -1,0 +1,157 @@
+"""Ground: vehicles on wheels move in planes where the lidar does not contradict it; this corrects their height."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scanchain import lie
+from scanchain.config import Config, GraphConfig
+from scanchain.data import KeyframeErrors, Matrix, Pose, Vector
+from scanchain.evaluation.consistency import with_map_errors
+from scanchain.graph.consistency import is_bent
+from scanchain.graph.factors import Prior
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.gravity import upright
+
+_UNEVEN_M, _UNEVEN_RAD = 0.02, 0.01  # largest σ of height and tilt in a plane, by the ground and the suspension
+_CORRELATED = 4  # number of successive keyframes that share such an error
+_MOUNTED_RAD = 0.05  # σ of the mounting of the lidar
+_PART_M = 50.0  # least length of the parts of the path that are tested, of which a plane has at least two
+_DRIFT = (
+    0.001  # largest drift of the height, as a share of the path: more is a hill unless the user says otherwise
+)
+_LEAST_SHARE = 0.5  # of the path in planes: parts of a rolling ground are flat by chance
+_HELD_M, _HELD_RAD = 1e-4, 1e-5  # σ of position and heading of the first pose along the ground
+
+
+def flattened(
+    graph: PoseGraph, errors: Sequence[KeyframeErrors], up: Vector, config: Config, *, levels: bool
+) -> tuple[PoseGraph, str]:
+    """A graph in space with priors of height and tilt of the poses that lie in planes, and a note on it.
+
+    The planes stay where the lidar has them, relative to each other.
+
+    errors : of the keyframes, which say how precise the edges are
+    up : (3,) of the vehicle, in the frame of the lidar
+    levels : whether the plane of the first pose becomes horizontal
+    """
+    at_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(graph.poses[:, :3, 3], axis=0), axis=1)))
+    parts = int(at_m[-1] / _PART_M)
+    if not parts:
+        return graph, ""
+    bounds = [*np.searchsorted(at_m, at_m[-1] * np.arange(parts) / parts).tolist(), len(graph)]
+    drift = np.inf if config.graph.ground == "on" else _DRIFT
+    test = _Test(with_map_errors(graph, errors, config)[0], up, bounds, drift)
+    planes = [each for each in test.planes(0, parts) if each and each.parts > 1 and not each.rolls]
+    share = sum(each.parts for each in planes) / parts
+    if share < _LEAST_SHARE:
+        return graph, ""
+    note = f"ground: flat over {100.0 * share:.0f} % of the path"
+    level, T_level = graph.copy(), lie.identity(3)
+    if levels and not planes[0].first:
+        T_level[:3, :3] = upright(_fitted(graph.poses[: planes[0].last], up)[0][:3, 2])
+        note += ", which levels the result"
+    level.move(0, T_level)
+    result = level.copy()
+    for each in planes:
+        _constrain(result, each.first, each.last, *_fitted(level.poses[each.first : each.last], up))
+    state = result.optimize(config.graph, initialize="given").state
+    if is_bent(level.state(), state, config.graph.robust_scale):
+        return graph, f"{note}, but contradicts the lidar by more than its standard deviations"
+    corrected_m = np.abs(state.poses[:, 2, 3] - level.poses[:, 2, 3]).max()
+    return result, f"{note}; its height is corrected by up to {corrected_m:.2g} m"
+
+
+@dataclass(frozen=True, slots=True)
+class _Plane:
+    """Poses ``first`` to ``last`` − 1, in ``parts`` of the path, that lie in a plane.
+
+    rolls : whether they do not lie in one together with those before or after, which lie in one by themselves
+    """
+
+    first: int
+    last: int
+    parts: int
+    rolls: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """Test for planes, by a graph with the covariances of its errors.
+
+    bounds : numbers of the poses between which the parts of the path are; drift : largest one, as ``_DRIFT``
+    """
+
+    graph: PoseGraph
+    up: Vector
+    bounds: Sequence[int]
+    drift: float
+
+    def planes(self, first: int, last: int) -> list[_Plane | None]:
+        """The planes of these parts in order, the largest that pass; None for a part that fails by itself."""
+        if last - first == 1:
+            return [self._plane(*self.bounds[first : last + 1], parts=1)]
+        middle = (first + last) // 2
+        *before, one = self.planes(first, middle)
+        other, *after = self.planes(middle, last)
+        if one is None or other is None:
+            return [*before, one, other, *after]
+        both = self._plane(one.first, other.last, parts=one.parts + other.parts)
+        if both is None:
+            return [*before, replace(one, rolls=True), replace(other, rolls=True), *after]
+        return [*before, replace(both, rolls=one.rolls or other.rolls), *after]
+
+    def _plane(self, first: int, last: int, *, parts: int) -> _Plane | None:
+        """The plane of poses; None where their edges contradict it, with a variance factor by their own misfit."""
+        graph, part, poses = self.graph, PoseGraph(3), self.graph.poses[first:last]
+        T_world_plane, up = _fitted(poses, self.up)
+        away_m = (poses[:, :3, 3] - T_world_plane[:3, 3]) @ T_world_plane[:3, 2]
+        if np.abs(away_m).max() > 3.0 * _UNEVEN_M + self.drift * parts * _PART_M:
+            return None
+        chosen = ~graph.is_rejected & ((graph.edges >= first) & (graph.edges < last)).all(axis=1)
+        for T, stamp_ns in zip(poses, graph.stamps_ns[first:last].tolist(), strict=True):
+            part.add_pose(T, stamp_ns)
+        edges = graph.edges[chosen] - first, graph.measurements[chosen], graph.information[chosen]
+        part.add_edges(*edges, np.zeros(int(chosen.sum()), np.bool_))
+        free = part.optimize(GraphConfig(), initialize="given")
+        _constrain(part, 0, len(part), T_world_plane, up)
+        state = part.optimize(GraphConfig(), initialize="given").state
+        variance = max(free.chi2_after / max(free.state.degrees_of_freedom, 1), 1.0)
+        is_flat = (state.chi2 - free.chi2_after) / variance < 3.0 * len(part) / _CORRELATED
+        return _Plane(first, last, parts) if is_flat else None
+
+
+def _fitted(poses: Matrix, up: Vector) -> tuple[Pose, Vector]:
+    """T_world_plane of poses (N, 4, 4), its z the normal, and upward direction of the vehicle in it on average.
+
+    The normal is that of the positions, and where they are on a line, by the mounting, ``up``.
+    """
+    T, mean = np.eye(4), (poses[:, :3, :3] @ up).mean(axis=0)
+    T[:3, 3], R = poses[:, :3, 3].mean(axis=0), upright(mean / np.linalg.norm(mean))
+    away = (poses[:, :3, 3] - T[:3, 3]) @ R.T
+    H = away[:, :2].T @ away[:, :2] + np.eye(2) * (_UNEVEN_M / _MOUNTED_RAD) ** 2
+    normal = R.T @ np.append(-np.linalg.solve(H, away[:, :2].T @ away[:, 2]), 1.0)
+    T[:3, :3] = upright(normal / np.linalg.norm(normal)).T
+    up = np.einsum("nji,j->i", poses[:, :3, :3], T[:3, 2])
+    return T, up / np.linalg.norm(up)
+
+
+def _constrain(graph: PoseGraph, first: int, last: int, T_world_plane: Pose, up: Vector) -> None:
+    """Add priors of height and tilt of poses in a plane, the first time also of where in it the first pose is."""
+    none = np.zeros((3, 3))
+    if not graph.is_of_origin.any():
+        normal = graph.poses[0, :3, :3].T @ T_world_plane[:3, 2]
+        across = np.outer(normal, normal)
+        held = np.block([[(np.eye(3) - across) / _HELD_M**2, none], [none, across / _HELD_RAD**2]])
+        graph.add_factor(Prior(), 0, held, graph.poses[0])
+    across = np.outer(up, up)
+    of_plane = np.block([[across / _UNEVEN_M**2, none], [none, (np.eye(3) - across) / _UNEVEN_RAD**2]])
+    Z = lie.inverse(T_world_plane) @ graph.poses[first:last]
+    turns = np.zeros((len(Z), 6))
+    turns[:, 3:] = np.cross(Z[:, :3, :3] @ up, [0.0, 0.0, 1.0])  # of small angles
+    Z[:, :3, :3], Z[:, 2, 3] = lie.exp(turns)[:, :3, :3] @ Z[:, :3, :3], 0.0
+    for k, T in enumerate(T_world_plane @ Z, first):
+        graph.add_factor(Prior(), k, of_plane / _CORRELATED, T)
