@@ -9,7 +9,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config, GraphConfig
-from scanchain.data import KeyframeErrors, Matrix, Pose, Vector
+from scanchain.data import Integers, KeyframeErrors, Matrix, Pose, Vector
 from scanchain.evaluation.consistency import with_map_errors
 from scanchain.graph.consistency import is_bent
 from scanchain.graph.factors import Prior
@@ -20,9 +20,8 @@ _UNEVEN_M, _UNEVEN_RAD = 0.02, 0.01  # largest σ of height and tilt in a plane,
 _CORRELATED = 4  # number of successive keyframes that share such an error
 _MOUNTED_RAD = 0.05  # σ of the mounting of the lidar
 _PART_M = 50.0  # least length of the parts of the path that are tested, of which a plane has at least two
-_DRIFT = (
-    0.001  # largest drift of the height, as a share of the path: more is a hill unless the user says otherwise
-)
+_MARGIN_M = 25.0  # at those ends of a plane that are not ends of the path, which may lie on a ramp
+_DRIFT = 0.001  # largest drift of the height, as a share of the path; more is a hill unless ``on``
 _LEAST_SHARE = 0.5  # of the path in planes: parts of a rolling ground are flat by chance
 _HELD_M, _HELD_RAD = 1e-4, 1e-5  # σ of position and heading of the first pose along the ground
 
@@ -49,15 +48,21 @@ def flattened(
     share = sum(each.parts for each in planes) / parts
     if share < _LEAST_SHARE:
         return graph, ""
+    ends_m = [at_m[[each.first, each.last - 1]] for each in planes]
+    margins_m = [_MARGIN_M * np.array([each.first > 0, each.last < len(graph)]) for each in planes]
+    inside = [
+        np.flatnonzero((at_m >= a + before) & (at_m <= b - after))
+        for (a, b), (before, after) in zip(ends_m, margins_m, strict=True)
+    ]
     note = f"ground: flat over {100.0 * share:.0f} % of the path"
     level, T_level = graph.copy(), lie.identity(3)
     if levels and not planes[0].first:
-        T_level[:3, :3] = upright(_fitted(graph.poses[: planes[0].last], up)[0][:3, 2])
+        T_level[:3, :3] = upright(_fitted(graph.poses[inside[0]], up)[0][:3, 2])
         note += ", which levels the result"
     level.move(0, T_level)
     result = level.copy()
-    for each in planes:
-        _constrain(result, each.first, each.last, *_fitted(level.poses[each.first : each.last], up))
+    for chosen in inside:
+        _constrain(result, chosen, *_fitted(level.poses[chosen], up))
     state = result.optimize(config.graph, initialize="given").state
     if is_bent(level.state(), state, config.graph.robust_scale):
         return graph, f"{note}, but contradicts the lidar by more than its standard deviations"
@@ -117,7 +122,7 @@ class _Test:
         edges = graph.edges[chosen] - first, graph.measurements[chosen], graph.information[chosen]
         part.add_edges(*edges, np.zeros(int(chosen.sum()), np.bool_))
         free = part.optimize(GraphConfig(), initialize="given")
-        _constrain(part, 0, len(part), T_world_plane, up)
+        _constrain(part, np.arange(len(part)), T_world_plane, up)
         state = part.optimize(GraphConfig(), initialize="given").state
         variance = max(free.chi2_after / max(free.state.degrees_of_freedom, 1), 1.0)
         is_flat = (state.chi2 - free.chi2_after) / variance < 3.0 * len(part) / _CORRELATED
@@ -139,7 +144,7 @@ def _fitted(poses: Matrix, up: Vector) -> tuple[Pose, Vector]:
     return T, up / np.linalg.norm(up)
 
 
-def _constrain(graph: PoseGraph, first: int, last: int, T_world_plane: Pose, up: Vector) -> None:
+def _constrain(graph: PoseGraph, chosen: Integers, T_world_plane: Pose, up: Vector) -> None:
     """Add priors of height and tilt of poses in a plane, the first time also of where in it the first pose is."""
     none = np.zeros((3, 3))
     if not graph.is_of_origin.any():
@@ -149,9 +154,9 @@ def _constrain(graph: PoseGraph, first: int, last: int, T_world_plane: Pose, up:
         graph.add_factor(Prior(), 0, held, graph.poses[0])
     across = np.outer(up, up)
     of_plane = np.block([[across / _UNEVEN_M**2, none], [none, (np.eye(3) - across) / _UNEVEN_RAD**2]])
-    Z = lie.inverse(T_world_plane) @ graph.poses[first:last]
+    Z = lie.inverse(T_world_plane) @ graph.poses[chosen]
     turns = np.zeros((len(Z), 6))
     turns[:, 3:] = np.cross(Z[:, :3, :3] @ up, [0.0, 0.0, 1.0])  # of small angles
     Z[:, :3, :3], Z[:, 2, 3] = lie.exp(turns)[:, :3, :3] @ Z[:, :3, :3], 0.0
-    for k, T in enumerate(T_world_plane @ Z, first):
+    for k, T in zip(chosen.tolist(), T_world_plane @ Z, strict=True):
         graph.add_factor(Prior(), k, of_plane / _CORRELATED, T)
