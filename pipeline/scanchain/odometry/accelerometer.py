@@ -144,7 +144,7 @@ class Accelerometer:
         self._update(np.eye(3, 12), innovation, C)
         turn = (
             R @ self.R_odom_lidar.T
-        )  # by the match, relative to the gyro; small: hat(its angles) = (turn − turnᵀ) / 2
+        )  # by the match, relative to the gyro, of small angles a: 2 hat(a) = turn − turnᵀ
         turned = 0.5 * _TURNED * (turn - turn.T) @ self.x[_G]
         self.P[_G, _G] += np.outer(turned, turned)
         size, along = float(np.linalg.norm(self.x[_G])), np.zeros((1, 12))
