@@ -30,7 +30,7 @@ from tests.support.scenes import ROOT, configured, shared_data
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else 20 s have no closures
-RECORDED = (*LOOPING, "--checkpoint", "0.2", "--error-bars", "quick")
+RECORDED = (*LOOPING, "--checkpoint", "0.1", "--error-bars", "quick")
 LIVELY = (*RECORDED, "--rerun", "off")
 
 

@@ -81,7 +81,7 @@ def wait_for_steps(child, out, steps):
     """Return once a run has so many steps in its checkpoint."""
     while steps_on_disk(out) < steps:
         assert child.poll() is None, "the run ended before"
-        time.sleep(0.05)
+        time.sleep(0.02)
 
 
 def same_result(a, b):

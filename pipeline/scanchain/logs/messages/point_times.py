@@ -44,6 +44,7 @@ _STEP = 0.25  # share of the usual span above which a step back starts a row, or
 _PART_OF_TURN = 0.6  # smallest share of the time of a turn that its beams take
 _SPANS = 100  # number of first scans whose spans are compared with the period
 _SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # limits of a span as a share of the period: outside, the unit is wrong
+_ROUNDING_RAD = 1e-6  # of an azimuth of a point in float32
 
 _LEFT_OUT = "contradict the others: these points are left out"
 _UNWRAPPED = "step back where a counter wrapped or was reset: repaired"
@@ -331,8 +332,9 @@ class PointTimes:
 def from_azimuth(points: RawPoints, config: LogConfig) -> NDArray[np.float32]:
     """Times (N,) of points (N, d) by the azimuth from that of the lidar at the stamp."""
     sense = -1.0 if config.point_times == "clockwise" else 1.0
-    turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
-    return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
+    turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad) + _ROUNDING_RAD
+    turned = np.maximum(turned % (2.0 * np.pi) - _ROUNDING_RAD, 0.0)  # else the first ray may be the last one
+    return (turned * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
 
 
 def _assumed(field: Field) -> str:
