@@ -1,9 +1,9 @@
 """This program against another commit of it: time, memory and poses, in turn on the same logs.
 
 Both are built into environments of their own, with the packages that they ask for, below --cache: in one for
-development memory is 6 % larger and a stage up to 8 % slower. Per log the two take turns, --repeats times, each time
-in a fresh process with compiled kernels; of every scan, kernel and run the least counts. A figure is this program's
-over that one's, below 1 where it got better:
+development memory is 6 % larger, and a stage up to 8 % slower. Per log the two take turns, --repeats times,
+each in a fresh process with compiled kernels; of every scan, kernel and run the least counts. A figure is this
+program's over that one's, below 1 where it got better:
 
   scan, p95  CPU time of ``Odometry.process`` a scan: median, and 95th percentile
   wall       its sum by the clock

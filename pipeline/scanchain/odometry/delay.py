@@ -56,11 +56,15 @@ class WheelPath:
 
     def odds(self, ends_s: Matrix, motions: Matrix) -> Vector:
         """Log-likelihood of each delay, if lengths and turns are linear in those of the scans (M, d+1, d+1)."""
-        after_s = _DELAYS_S[:, None, None, None] + 0.5 * self.width_s * np.array([-1.0, 1.0])  # (D, 1, 1, 2)
-        ends = (
-            np.diff(np.interp(ends_s[..., None] + after_s, self.times_s, each))[..., 0] for each in self.integral.T
+        at_s, index = np.unique(
+            ends_s, return_inverse=True
+        )  # most are the end of one motion and the start of another
+        first, last = index.reshape(ends_s.shape).T
+        after_s = _DELAYS_S[:, None, None] + 0.5 * self.width_s * np.array([-1.0, 1.0])  # (D, 1, 2)
+        path = (
+            np.diff(np.interp(at_s[:, None] + after_s, self.times_s, each))[..., 0] for each in self.integral.T
         )
-        x, y, turns = (np.diff(each / self.width_s)[..., 0] for each in ends)  # (D, M)
+        x, y, turns = ((each[:, last] - each[:, first]) / self.width_s for each in path)  # (D, M)
         known, total = np.ones(turns.shape, bool), np.zeros(len(_DELAYS_S))
         of_scans = np.linalg.norm(motions[:, :-1, -1], axis=1), np.abs(lie.log(motions)[:, -1])
         for measured, by_scans in zip((np.hypot(x, y), np.abs(turns)), of_scans, strict=True):

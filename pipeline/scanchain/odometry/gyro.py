@@ -129,8 +129,6 @@ class Gyro:
     def correct(self, T_previous_current: Pose | None) -> None:
         """Compare with the motion between the middles of the last scan and this one, None where it is unknown."""
         begin_s, self.last_s, self.innovation = self.last_s, self.now_s, math.nan
-        if not self.blocks:
-            return
         self.scans += 1
         self.used += self.is_used and self.turning is not None
         if T_previous_current is None or not self.now_s > begin_s:

@@ -289,8 +289,10 @@ class Predictor:
     @property
     def innovations(self) -> dict[str, float]:
         """Normalized innovation of each sensor at the last scan, NaN where it was not compared."""
-        sensors = {"wheels": self.wheels, "gyro": self.gyro, "accelerometer": self.accelerometer}
-        return {name: sensor.innovation for name, sensor in sensors.items()}
+        found = {"wheels": self.wheels.innovation}
+        if self.gyro.blocks:
+            found |= {"gyro": self.gyro.innovation, "accelerometer": self.accelerometer.innovation}
+        return found
 
     def warnings(self) -> tuple[str, ...]:
         """Defects of wheels and IMU, one per line."""
@@ -310,11 +312,12 @@ class Predictor:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
             self.scan_motion = prediction.scan_motion_by(lie.log(self.T_previous_current))
             self._update(prediction, match, state)
-        is_known = self.scans > 0 and not scan.clock_jump_s and _shows_rotation(match, state)
-        self.gyro.correct(self.T_previous_current if is_known else None)
-        if self.gyro.size == 3 and self.gyro.blocks:
-            continued = prediction.T_odom_last @ before
-            self.accelerometer.correct(T_odom_lidar, None if state is State.LOST else match, continued[:3, 3])
+        if self.gyro.blocks:
+            is_known = self.scans > 0 and not scan.clock_jump_s and _shows_rotation(match, state)
+            self.gyro.correct(self.T_previous_current if is_known else None)
+            if self.gyro.size == 3:
+                continued = prediction.T_odom_last @ before
+                self.accelerometer.correct(T_odom_lidar, None if state is State.LOST else match, continued[:3, 3])
         self.scans += 1
         is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)
         self.doubtful += max(1.0 - _MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)

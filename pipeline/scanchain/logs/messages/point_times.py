@@ -332,8 +332,8 @@ class PointTimes:
 def from_azimuth(points: RawPoints, config: LogConfig) -> NDArray[np.float32]:
     """Times (N,) of points (N, d) by the azimuth from that of the lidar at the stamp."""
     sense = -1.0 if config.point_times == "clockwise" else 1.0
-    turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad) + _ROUNDING_RAD
-    turned = np.maximum(turned % (2.0 * np.pi) - _ROUNDING_RAD, 0.0)  # else the first ray may be the last one
+    turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad) % (2.0 * np.pi)
+    turned[turned > 2.0 * np.pi - _ROUNDING_RAD] = 0.0  # else the first ray may be the last one
     return (turned * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
 
 
