@@ -324,11 +324,7 @@ def _apart(sighted: _Sighted, T_enu_world: Pose) -> tuple[Integers, float]:
 
 def _tied(graph: PoseGraph, keyframes: Integers, sighted: _Sighted, T_enu_world: Pose, up: Vector) -> PoseGraph:
     """A graph of the edges in force of another one, not robust here, and of robust positions by fixes."""
-    tied, kept = PoseGraph(graph.dimension), ~(graph.is_rejected | graph.is_of_origin)
-    for T, stamp_ns in zip(graph.poses, graph.stamps_ns.tolist(), strict=True):
-        tied.add_pose(T, stamp_ns)
-    edges = graph.edges[kept], graph.measurements[kept], graph.information[kept]
-    tied.add_edges(*edges, np.zeros(int(kept.sum()), np.bool_))
+    tied = graph.in_force(0, len(graph))
     _constrain(tied, keyframes, tied.poses[keyframes], sighted, T_enu_world, up, RobustPosition())
     return tied
 

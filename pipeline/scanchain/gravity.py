@@ -18,12 +18,21 @@ from scanchain.graph.pose_graph import PoseGraph
 
 _CORRELATED_S, _LEAST_S = 1.0, 0.01  # time constant of the errors, and least time between keyframes
 _SURE = 0.999  # probability that errors as stated pass the test
-_HELD_M, _HELD_RAD = 1e-4, 1e-5  # σ of position and heading of the first pose, which gravity leaves free
+_HELD_M, _HELD_RAD = 1e-4, 1e-5  # σ of position and heading of the first pose, which gravity and ground leave free
 
 
 def upright(up: Vector) -> Matrix:
     """The smallest rotation (3, 3) that makes a unit vector vertical."""
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
+
+
+def hold_first(graph: PoseGraph, up: Vector, *, height: bool) -> None:
+    """Add a prior of the first pose: heading about ``up`` (3,), position along the ground, and ``height``."""
+    normal, information = graph.poses[0, :3, :3].T @ up, np.zeros((6, 6))
+    across = np.outer(normal, normal)
+    information[:3, :3] = (np.eye(3) if height else np.eye(3) - across) * _HELD_M**-2.0
+    information[3:, 3:] = across * _HELD_RAD**-2.0
+    graph.add_factor(Prior(), 0, information, graph.poses[0])
 
 
 def leveled(graph: PoseGraph, forces: Mapping[int, RestForce], config: GraphConfig) -> tuple[PoseGraph, str]:
@@ -67,9 +76,7 @@ def _tilt_sigma(up: Vector, covariance: Matrix) -> float:
 
 def _constrain(graph: PoseGraph, chosen: Integers, ups: Matrix, sigma_rad: Vector) -> None:
     """Add priors of the tilt of poses (N,), and one of the first one's position and heading."""
-    first, information = graph.poses[0], np.eye(6) * _HELD_M**-2.0
-    information[3:, 3:] = np.outer(first[2, :3], first[2, :3]) * _HELD_RAD**-2.0
-    graph.add_factor(Prior(), 0, information, first)
+    hold_first(graph, np.array([0.0, 0.0, 1.0]), height=True)
     for k, up, sigma in zip(chosen.tolist(), ups, sigma_rad.tolist(), strict=True):
         Z, information = graph.poses[k].copy(), np.zeros((6, 6))
         Z[:3, :3] = upright(Z[:3, :3] @ up) @ Z[:3, :3]

@@ -14,7 +14,7 @@ from scanchain.evaluation.consistency import with_map_errors
 from scanchain.graph.consistency import is_bent
 from scanchain.graph.factors import Prior
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.gravity import upright
+from scanchain.gravity import hold_first, upright
 
 _UNEVEN_M, _UNEVEN_RAD = 0.02, 0.01  # largest σ of height and tilt in a plane, by the ground and the suspension
 _CORRELATED = 4  # number of successive keyframes that share such an error
@@ -23,7 +23,6 @@ _PART_M = 50.0  # least length of the parts of the path that are tested, of whic
 _MARGIN_M = 25.0  # at those ends of a plane that are not ends of the path, which may lie on a ramp
 _DRIFT = 0.001  # largest drift of the height, as a share of the path; more is a hill unless ``on``
 _LEAST_SHARE = 0.5  # of the path in planes: parts of a rolling ground are flat by chance
-_HELD_M, _HELD_RAD = 1e-4, 1e-5  # σ of position and heading of the first pose along the ground
 
 
 def flattened(
@@ -111,16 +110,11 @@ class _Test:
 
     def _plane(self, first: int, last: int, *, parts: int) -> _Plane | None:
         """The plane of poses; None where their edges contradict it, with a variance factor by their own misfit."""
-        graph, part, poses = self.graph, PoseGraph(3), self.graph.poses[first:last]
+        part, poses = self.graph.in_force(first, last), self.graph.poses[first:last]
         T_world_plane, up = _fitted(poses, self.up)
         away_m = (poses[:, :3, 3] - T_world_plane[:3, 3]) @ T_world_plane[:3, 2]
         if np.abs(away_m).max() > 3.0 * _UNEVEN_M + self.drift * parts * _PART_M:
             return None
-        chosen = ~graph.is_rejected & ((graph.edges >= first) & (graph.edges < last)).all(axis=1)
-        for T, stamp_ns in zip(poses, graph.stamps_ns[first:last].tolist(), strict=True):
-            part.add_pose(T, stamp_ns)
-        edges = graph.edges[chosen] - first, graph.measurements[chosen], graph.information[chosen]
-        part.add_edges(*edges, np.zeros(int(chosen.sum()), np.bool_))
         free = part.optimize(GraphConfig(), initialize="given")
         _constrain(part, np.arange(len(part)), T_world_plane, up)
         state = part.optimize(GraphConfig(), initialize="given").state
@@ -146,13 +140,9 @@ def _fitted(poses: Matrix, up: Vector) -> tuple[Pose, Vector]:
 
 def _constrain(graph: PoseGraph, chosen: Integers, T_world_plane: Pose, up: Vector) -> None:
     """Add priors of height and tilt of poses in a plane, the first time also of where in it the first pose is."""
-    none = np.zeros((3, 3))
     if not graph.is_of_origin.any():
-        normal = graph.poses[0, :3, :3].T @ T_world_plane[:3, 2]
-        across = np.outer(normal, normal)
-        held = np.block([[(np.eye(3) - across) / _HELD_M**2, none], [none, across / _HELD_RAD**2]])
-        graph.add_factor(Prior(), 0, held, graph.poses[0])
-    across = np.outer(up, up)
+        hold_first(graph, T_world_plane[:3, 2], height=False)
+    across, none = np.outer(up, up), np.zeros((3, 3))
     of_plane = np.block([[across / _UNEVEN_M**2, none], [none, (np.eye(3) - across) / _UNEVEN_RAD**2]])
     Z = lie.inverse(T_world_plane) @ graph.poses[chosen]
     turns = np.zeros((len(Z), 6))

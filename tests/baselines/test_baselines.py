@@ -131,7 +131,7 @@ def test_poses_of_a_steady_motion_are_moved_to_the_stamp_exactly_across_gaps_too
 def test_a_pose_holds_at_the_stamp_wherever_it_lies_in_the_sweep(name, distorted):
     """Half a sweep off is 0.4 m along the road, which the bend turns into an error of the path's shape."""
     errors_m = [ate_m(name, distorted, stamp_share) for stamp_share in (0.0, 1.0)]
-    assert np.ptp(errors_m) < 0.03, errors_m
+    assert np.ptp(errors_m) < (0.03 if name == "rko-lio" else 0.02), errors_m  # whose ATE here is 0.1 m
 
 
 @pytest.mark.parametrize("name", ["kiss-icp", "genz-icp", "genz-icp-kitti"])

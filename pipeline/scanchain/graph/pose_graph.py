@@ -394,6 +394,16 @@ class PoseGraph:
         result.since, result.work = self.since, self.work
         return result
 
+    def in_force(self, first: int, last: int) -> PoseGraph:
+        """A graph of the poses ``first`` to ``last`` − 1 and the edges in force between them, none robust."""
+        graph = PoseGraph(self.dimension)
+        for T, stamp_ns in zip(self.poses[first:last], self.stamps_ns[first:last].tolist(), strict=True):
+            graph.add_pose(T, stamp_ns)
+        kept = ~self.is_rejected & ((self.edges >= first) & (self.edges < last)).all(axis=1)
+        edges = self.edges[kept] - first, self.measurements[kept], self.information[kept]
+        graph.add_edges(*edges, np.zeros(int(kept.sum()), np.bool_))
+        return graph
+
     def with_information(self, information: Matrix) -> PoseGraph:
         """A copy with these information matrices (E, k, k) and the corrected measurements of this graph."""
         result = self.copy()

@@ -387,7 +387,7 @@ def garage(rng: np.random.Generator) -> Solids:
         top = story * (x - foot) / (head - foot)
         scenery.box((x, -0.5 * depth), (_SLAB_M, depth), (top - slab, top))
     for x, y, low in product(np.arange(12.0, 48.0, 9.0), (14.0, 26.0), (0.0, story)):
-        x += rng.uniform(-3.0, 3.0)  # the floors are not alike
+        x += rng.uniform(-3.0, 3.0)  # else the floors would be perceptually aliased
         scenery.box((x, y), (0.5, 0.5), (low, low + height))
         car = rng.uniform([2.5, -3.0, 1.4], [3.5, 3.0, 2.0])
         scenery.box((x + car[0], y + car[1]), (1.8, 4.5), (low + 0.3, low + car[2]))
