@@ -68,8 +68,8 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
     imu_topic : IMU, ``sensor_msgs/Imu``, used where it predicts motions better than the scans; found
         automatically where empty, ``none`` leaves it unused
-    gnss_topic : GNSS receiver, ``sensor_msgs/NavSatFix``, which gives the result its place on Earth, see
-        ``graph.gnss``; found automatically where empty, ``none`` leaves it unused
+    gnss_topic : GNSS receiver (``NavSatFix``, ``GPSFix``, ``LocationFix``), which gives the result its place on
+        Earth, see ``graph.gnss``; found automatically where empty, ``none`` leaves it unused
     lidar_pose : pose of the lidar on its base, ``x y z qx qy qz qw``; by the transforms where empty
     other_lidar_poses : poses of the other lidars in the frame of the first one, separated by commas; by the
         transforms where empty

@@ -1,22 +1,28 @@
 """The GNSS receiver of a log: its topic, its antenna, the fixes of a scan, and the files of a run."""
 
 import json
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import laspy
 import numpy as np
 import pytest
+from foxglove import messages as fox
+from foxglove.channels import LocationFixChannel
+from rosbags.typesys import get_types_from_msg
 
 import scanchain
 from scanchain import lie
 from scanchain.errors import InputError
 from scanchain.geodesy import Geodesy
+from scanchain.logs.index import Channel
 from scanchain.logs.info import describe
 from scanchain.logs.writer import LogWriter, pack_fix
 from scanchain.settings import load_settings
 from scanchain.simulation import plan
 from scanchain.simulation.gnss import ORIGIN, RECEIVERS, T_ENU_WORLD
-from tests.support import made
+from tests.support import made, recorders
+from tests.support.naive_logs import ROS1, ROS2, Ros
 
 MIDDLE = (49.0, 8.4, 100.0)
 
@@ -172,3 +178,85 @@ def test_a_run_writes_its_origin_a_track_and_a_map_with_its_coordinate_system(ru
     (middle,), _ = geodesy.projected(enu.positions.mean(axis=0, keepdims=True))
     assert np.linalg.norm(np.mean([cloud.x, cloud.y], axis=1) - middle[:2]) < 20.0
     assert "note           GNSS: " in (run / "summary.txt").read_text()
+
+
+GPS_STATUS = """std_msgs/Header header
+uint16 satellites_used
+int32[] satellite_used_prn
+uint16 satellites_visible
+int32[] satellite_visible_prn
+int32[] satellite_visible_z
+int32[] satellite_visible_azimuth
+int32[] satellite_visible_snr
+int16 status
+uint16 motion_source
+uint16 orientation_source
+uint16 position_source"""
+FLOATS = """latitude longitude altitude track speed climb pitch roll dip time gdop pdop hdop vdop tdop
+    err err_horz err_vert err_track err_speed err_climb err_time err_pitch err_roll err_dip"""
+GPS_FIX = "\n".join([
+    "std_msgs/Header header", "GPSStatus status", *(f"float64 {name}" for name in FLOATS.split()),
+    "float64[9] position_covariance", "uint8 position_covariance_type",
+])  # fmt: skip
+
+
+def gps_fix(store, package, stamp_ns, status):
+    """A serialized GPSFix at MIDDLE with standard deviations of 1, 1 and 2 m."""
+    ros, prn = Ros(store), np.arange(3, dtype=np.int32)
+    for name, definition in (("GPSStatus", GPS_STATUS), ("GPSFix", GPS_FIX)):
+        store.register(get_types_from_msg(definition, f"{package}/msg/{name}"))
+    head, kind = ros.header(stamp_ns, "a"), f"{package}/msg/GPSFix"
+    of_status = store.types[f"{package}/msg/GPSStatus"](head, 3, prn, 3, prn, prn, prn, prn, status, 1, 1, 1)
+    covariance = np.diag([1.0, 1.0, 4.0]).ravel()
+    return ros.serialize(store.types[kind](head, of_status, *MIDDLE, *np.arange(22.0), covariance, 2), kind)
+
+
+def of_ros2(channel, stamp_ns, status):
+    data = gps_fix(ROS2, "gps_msgs", stamp_ns, status)
+    return replace(channel, type_name="gps_msgs/msg/GPSFix"), data
+
+
+def of_ros1(channel, stamp_ns, status):
+    data = gps_fix(ROS1, "gps_common", stamp_ns, status)
+    return replace(channel, type_name="gps_common/GPSFix", encoding="ros1"), data
+
+
+def of_json(channel, stamp_ns, status):
+    sec, nsec = divmod(stamp_ns, 1_000_000_000)
+    told = {"timestamp": {"sec": sec, "nsec": nsec}, "frame_id": "a"}
+    told |= dict(zip(("latitude", "longitude", "altitude"), MIDDLE, strict=True))
+    told |= (
+        {"position_covariance": [1, 0, 0, 0, 1, 0, 0, 0, 4], "position_covariance_type": 2} if status >= 0 else {}
+    )
+    data = json.dumps(told).encode()
+    return replace(channel, type_name="foxglove.LocationFix", encoding="json", schema_encoding="jsonschema"), data
+
+
+@pytest.mark.parametrize(("written", "without_fix"), [(of_ros2, 0), (of_ros1, 0), (of_json, 1)])
+def test_fixes_of_gps_receivers_and_of_foxglove_are_read(log, tmp_path, written, without_fix):
+    begin_ns = int(scanchain.open_log(log).expected_stamps("/scan")[0])
+    bare = Channel((0, 0), "/b", "cdr", 0, "", "ros2msg", b"")
+    with LogWriter(tmp_path / "more.mcap") as writer:
+        for k, status in enumerate((0, 2, -1)):
+            channel, data = written(bare, begin_ns + k * 100_000_000, status)
+            writer.copy(channel, begin_ns + k * 100_000_000, data)
+    fixes = fixes_of(scanchain.open_log([log, tmp_path / "more.mcap"], gnss_topic="/b"))
+    stamps_ns = np.concatenate([each.stamps_ns for each in fixes])
+    np.testing.assert_array_equal(stamps_ns, begin_ns + np.arange(2 + without_fix) * 100_000_000)
+    np.testing.assert_array_equal(np.concatenate([each.positions for each in fixes])[:2], [MIDDLE] * 2)
+    sigmas = np.sqrt(np.concatenate([each.covariances for each in fixes]).diagonal(axis1=1, axis2=2))
+    np.testing.assert_allclose(sigmas, [[1.0, 1.0, 2.0]] * 2 + [[5.0, 5.0, 10.0]] * without_fix)
+
+
+def test_fixes_of_foxglove_in_protobuf_are_read(log, tmp_path):
+    begin_ns = int(scanchain.open_log(log).expected_stamps("/scan")[0])
+    sec, nsec = divmod(begin_ns, 1_000_000_000)
+    position = dict(zip(("latitude", "longitude", "altitude"), MIDDLE, strict=True))
+    context = recorders.Context()
+    with recorders.open_mcap(tmp_path / "more.mcap", context=context):
+        fix = fox.LocationFix(timestamp=fox.Timestamp(sec=sec, nsec=nsec), frame_id="a", **position)
+        LocationFixChannel("/b", context=context).log(fix, log_time=begin_ns)
+    (fixes,) = fixes_of(scanchain.open_log([log, tmp_path / "more.mcap"], gnss_topic="/b"))
+    assert fixes.stamps_ns.tolist() == [begin_ns]
+    np.testing.assert_array_equal(fixes.positions, [MIDDLE])
+    np.testing.assert_allclose(np.sqrt(fixes.covariances[0].diagonal()), [5.0, 5.0, 10.0])

@@ -153,7 +153,10 @@ def find_sensors(
     return imu and Sensor(imu.topic, reader(imu), T_imu), gnss and Sensor(gnss.topic, reader(gnss), T_gnss)
 
 
-_SENSORS = {"imu": ("IMU", "sensor_msgs/Imu"), "gnss": ("GNSS receiver", "sensor_msgs/NavSatFix")}  # name and type
+_SENSORS = {  # name and types
+    "imu": ("IMU", "sensor_msgs/Imu"),
+    "gnss": ("GNSS receiver", "sensor_msgs/NavSatFix, gps_msgs/GPSFix or foxglove.LocationFix"),
+}
 
 
 def _only(indexes: Sequence[FileIndex], sensor: Role, wanted: str, notes: list[str]) -> Channel | None:

@@ -16,7 +16,7 @@ _USES = {
     "imu": ("IMU", "predicts motions where it does so better than the scans"),
     "gnss": ("GNSS", "its fixes give the place on Earth, and correct drift where they show any"),
 }
-_NOT_READ = "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"  # of GNSS
+_NOT_READ = "nmea_msgs/Sentence", "foxglove.LocationFixes"  # of GNSS
 
 
 def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
@@ -122,7 +122,7 @@ def other_sensors(
                 use = f"{placed[topic]}; {use}" if topic in placed else unused
             found.append(OtherSensor(sensor, topic, use))
         elif kind(channel) in _NOT_READ:
-            found.append(OtherSensor("GNSS", topic, "not used: only sensor_msgs/NavSatFix is read"))
+            found.append(OtherSensor("GNSS", topic, f"not used: {kind(channel)} is not read"))
         elif has_poses(channel) and topic != wheels:
             use = f"--gt {topic} uses them as ground truth, --log.odometry_topic {topic} as wheels"
             found.append(OtherSensor("poses", topic, f"not used; {use}"))

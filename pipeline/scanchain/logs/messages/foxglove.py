@@ -1,4 +1,4 @@
-"""Foxglove's messages LaserScan, PointCloud, PoseInFrame and FrameTransforms, in JSON or Protobuf.
+"""Foxglove's messages LaserScan, PointCloud, PoseInFrame, FrameTransforms, LocationFix, in JSON or Protobuf.
 
 Schemas: https://docs.foxglove.dev/docs/sdk/schemas. The records are those of JSON; messages parsed by Protobuf
 have the same attributes.
@@ -16,6 +16,7 @@ from msgspec import Struct, field
 
 from scanchain.data import Pose
 from scanchain.logs.index import Channel
+from scanchain.logs.messages.gnss import Fix, fix_of
 from scanchain.logs.messages.lidar import Sensed
 from scanchain.logs.messages.poses import Frames, StampedPose, pose_of
 from scanchain.logs.messages.ros import MalformedMessageError, frame_name, header, new, point_fields
@@ -88,6 +89,16 @@ class _FrameTransforms(Struct, frozen=True):
     transforms: list[_FrameTransform]
 
 
+class _LocationFix(Struct, frozen=True):
+    latitude: float
+    longitude: float
+    altitude: float = 0.0
+    position_covariance: list[float] = []
+    position_covariance_type: int = 0
+    timestamp: _Stamp = _Stamp()
+    frame_id: str = ""
+
+
 def laser_scan(message: _LaserScan) -> Sensed:
     """The message as a sensor_msgs/LaserScan, without range limits and times, which Foxglove lacks."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -134,6 +145,11 @@ def frame_transform(message: _FrameTransform, link: Frames | None = None, dimens
 def frame_transforms(message: _FrameTransforms, **chosen: Any) -> list[StampedPose]:
     """All transforms of a foxglove.FrameTransforms, or those between the frames of ``link``."""
     return [transform for each in message.transforms for transform in frame_transform(each, **chosen)]
+
+
+def location_fix(message: _LocationFix) -> Fix:
+    """A foxglove.LocationFix."""
+    return fix_of(message, _stamp_ns(message.timestamp), frame_name(message.frame_id))
 
 
 def _stamp_ns(stamp: _Stamp) -> int:

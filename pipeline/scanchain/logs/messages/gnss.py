@@ -1,4 +1,4 @@
-"""Fixes of a GNSS receiver: of sensor_msgs/NavSatFix."""
+"""Fixes of a GNSS receiver: of NavSatFix, GPSFix and Foxglove's LocationFix."""
 
 from __future__ import annotations
 
@@ -22,17 +22,20 @@ class Fix(NamedTuple):
 
 
 def read_fix(message: Any) -> list[Fix]:
-    """A sensor_msgs/NavSatFix; nothing while the receiver has no fix.
+    """A sensor_msgs/NavSatFix or a GPSFix; nothing while the receiver has no fix. Raises as ``fix_of`` does."""
+    return [fix_of(message, stamp_ns(message), frame_of(message))] if message.status.status >= 0 else []
+
+
+def fix_of(message: Any, at_ns: int, frame: str) -> Fix:
+    """The position and covariance of a message.
 
     Raises MalformedMessageError for a position that is none on Earth.
     """
-    if message.status.status < 0:
-        return []
     position = float(message.latitude), float(message.longitude), float(message.altitude)
     if not (abs(position[0]) <= 90.0 and abs(position[1]) <= 360.0 and np.isfinite(position[2])):
         raise MalformedMessageError("its position is none on Earth")
-    covariance = np.array(message.position_covariance, np.float64).reshape(3, 3)
-    is_stated = message.position_covariance_type > 0 and np.isfinite(covariance).all()
-    if not is_stated or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+    covariance = np.array(message.position_covariance, np.float64)
+    is_stated = message.position_covariance_type > 0 and covariance.size == 9 and np.isfinite(covariance).all()
+    if not is_stated or np.linalg.eigvalsh(covariance.reshape(3, 3))[0] <= 0.0:
         covariance = np.diag(np.square(_UNKNOWN_M))
-    return [Fix(stamp_ns(message), frame_of(message), position, covariance)]
+    return Fix(at_ns, frame, position, covariance.reshape(3, 3))

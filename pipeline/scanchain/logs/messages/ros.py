@@ -3,12 +3,32 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 from typing import Any
 
 from scanchain.errors import one_line, printable
 
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of sensor_msgs/PointField
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_GPS = {  # of gps_msgs and gps_common: the types of the fields, each with names
+    "GPSStatus": (
+        "std_msgs/Header header",
+        "uint16 satellites_used",
+        "int32[] satellite_used_prn",
+        "uint16 satellites_visible",
+        "int32[] satellite_visible_prn satellite_visible_z satellite_visible_azimuth satellite_visible_snr",
+        "int16 status",
+        "uint16 motion_source orientation_source position_source",
+    ),
+    "GPSFix": (
+        "std_msgs/Header header",
+        "GPSStatus status",
+        "float64 latitude longitude altitude track speed climb pitch roll dip time gdop pdop hdop vdop tdop",
+        "float64 err err_horz err_vert err_track err_speed err_climb err_time err_pitch err_roll err_dip",
+        "float64[9] position_covariance",
+        "uint8 position_covariance_type",
+    ),
+}
 
 
 class MalformedMessageError(Exception):
@@ -21,11 +41,14 @@ class MalformedMessageError(Exception):
 @cache
 def typestore(encoding: str = "cdr") -> Any:
     """Message types of ROS 2, or of ROS 1 for the encoding ``ros1``."""
-    from rosbags.typesys import Stores, get_typestore  # takes 0.05 s
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # takes 0.05 s
 
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
     if encoding == "ros1":  # which has it outside of the core types
         store.register({_TRANSFORMS: typestore().fielddefs[_TRANSFORMS]})
+    for package, (name, fields) in product(("gps_msgs", "gps_common"), _GPS.items()):  # nor are these among them
+        pairs = ((kind, each) for kind, *names in map(str.split, fields) for each in names)
+        store.register(get_types_from_msg("\n".join(map(" ".join, pairs)), f"{package}/msg/{name}"))
     return store
 
 
