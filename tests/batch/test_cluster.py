@@ -6,6 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.batch.batch import Batch, on_cluster, run_batch
+from scanchain.batch.task import attempt
 from tests.support import made
 from tests.support.scenes import ROOT
 
@@ -41,7 +42,7 @@ def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
     try:
         doomed = cluster.add_node(**options)
         cluster.wait_for_nodes()
-        work = on_cluster(cluster.address)
+        work = on_cluster(cluster.address, attempt)
         watching = Watching(2, lambda: cluster.remove_node(doomed, allow_graceful=False))
         batched = run_batch(Batch(tuple(logs), tmp_path / "out", arguments=("--rerun", "off")), watching, work)
     finally:

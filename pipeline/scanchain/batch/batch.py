@@ -12,6 +12,7 @@ from functools import partial
 from glob import glob
 from pathlib import Path
 from threading import Event
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -39,6 +40,8 @@ _NUMBERS = (
 _FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "traveled_m", "chi2", "median_residual_m")
 _ERRORS = ("ate_rmse_m", "ate_share_of_path", "kitti_translation_share", "kitti_rotation_rad_per_m")
 
+T = TypeVar("T")
+R = TypeVar("R")
 Work = Callable[[Sequence[Task]], Iterator[Row]]
 
 
@@ -94,7 +97,7 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
     On Ctrl-C running logs are killed, and the table lists those not run. Raises InputError for a directory that
     cannot be created or holds something else, and for an invalid configuration.
     """
-    _check_out(batch)
+    check_out(batch.out, batch.logs, "a batch", ROWS_FOLDER)
     key_of("", batch.config_file, batch.overrides)  # an invalid configuration is invalid for every log
     try:
         (batch.out / ROWS_FOLDER).mkdir(parents=True, exist_ok=True)
@@ -121,19 +124,21 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
     return Batched(table, kept, write_table(batch.out, table))
 
 
-def _check_out(batch: Batch) -> None:
-    """Raise InputError for a directory that holds anything but a batch, or lies in a run or in a log folder."""
-    if complaint := misspelled(batch.out):
+def check_out(out: Path, logs: Sequence[Source], kind: str, marker: str) -> None:
+    """Raise InputError for a directory that holds something else, or lies in a run or in a log folder.
+
+    kind, marker : what may be continued there, and the file or folder that only such a directory contains
+    """
+    if complaint := misspelled(out):
         raise InputError(complaint)
-    check_outside_runs(batch.out)
-    out = batch.out.resolve()
-    for log in batch.logs:
-        if isinstance(log, Path) and log.resolve() in (out, *out.parents):
-            raise InputError(f"{batch.out}: lies in the log {log}; choose another --out")
-    if out.is_dir() and any(out.iterdir()) and not (out / ROWS_FOLDER).is_dir():
-        raise InputError(
-            f"{batch.out}: is not empty and not a batch ({ROWS_FOLDER} is missing); choose another --out"
-        )
+    check_outside_runs(out)
+    for log in logs:
+        if isinstance(log, Path) and log.resolve() in (out.resolve(), *out.resolve().parents):
+            raise InputError(f"{out}: lies in the log {log}; choose another --out")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; choose another --out")
+    if out.is_dir() and any(out.iterdir()) and not (out / marker).exists():
+        raise InputError(f"{out}: is not empty and not {kind} ({marker} is missing); choose another --out")
 
 
 def _tasks(batch: Batch) -> list[Task]:
@@ -169,10 +174,13 @@ def _local(workers: int, tasks: Sequence[Task]) -> Iterator[Row]:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def on_cluster(address: str) -> Work:
-    """Runner of tasks on a Ray cluster with access to the same files, one core per log; retries if a node dies.
+def on_cluster(
+    address: str, attempt: Callable[[T], R], *, has_whole_node: bool = False
+) -> Callable[[Sequence[T]], Iterator[R]]:
+    """Runner of tasks on a Ray cluster with access to the same files, one core per task; retries if a node dies.
 
     address : of the cluster's head node, or "auto" for the cluster that this machine belongs to
+    has_whole_node : whether a task has a node to itself instead, as where times are measured
     Raises MissingExtraError without Ray, InputError where no cluster responds.
     """
     try:
@@ -184,9 +192,10 @@ def on_cluster(address: str) -> Work:
     except (ConnectionError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"--ray is {address!r}: {reason}; start a cluster with ray start --head") from None
-    remote = ray.remote(num_cpus=1, max_retries=_NODE_LOSSES)(attempt)
+    cores = min((node["Resources"].get("CPU", 1) for node in ray.nodes()), default=1) if has_whole_node else 1
+    remote = ray.remote(num_cpus=cores, max_retries=_NODE_LOSSES)(attempt)
 
-    def work(tasks: Sequence[Task]) -> Iterator[Row]:
+    def work(tasks: Sequence[T]) -> Iterator[R]:
         waiting = [remote.remote(task) for task in tasks]
         try:
             while waiting:

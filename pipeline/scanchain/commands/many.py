@@ -1,11 +1,11 @@
-"""``scanchain batch`` and ``compare``: runs of many logs, and a comparison of many methods on one log."""
+"""``scanchain batch`` and ``compare``: runs of many logs, and comparisons of methods on one log or several."""
 
 from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,9 @@ from scanchain.commands.options import LOG, PATH, OverrideCommand
 from scanchain.errors import InputError, ScanchainError, counted, folded
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
+
+if TYPE_CHECKING:
+    from scanchain.comparison.overall import Overall
 
 _DAY_S = 86_400.0  # time limit of a log where none is given
 
@@ -85,6 +88,7 @@ def batch(
       scanchain batch 's3://bucket/drives/*.mcap' --out runs/drives
     """
     from scanchain.batch.batch import Batch, collect, on_cluster, run_batch
+    from scanchain.batch.task import attempt
     from scanchain.commands.terminal import Terminal
 
     if ray is not None and workers is not None:
@@ -107,7 +111,7 @@ def batch(
     from scanchain_viz.report.batch import write_batch_report
 
     with Terminal("logs") as terminal:
-        batched = run_batch(job, terminal, None if ray is None else on_cluster(ray))
+        batched = run_batch(job, terminal, None if ray is None else on_cluster(ray, attempt))
     click.echo(folded(batched.summary), nl=False)
     write_batch_report(job.out, batched.rows, sys.argv)
     files = "batch.parquet, report.html, summary.txt"
@@ -126,7 +130,13 @@ def batch(
     default="",
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
-@click.option("--out", metavar="DIR", type=PATH, help="Directory to create. [default: runs/compare-LOG]")
+@click.option(
+    "--out",
+    metavar="DIR",
+    type=PATH,
+    help="Directory to create; of several logs, to create or to continue. [default: runs/compare-LOG]",
+)
+@click.option("--site", metavar="DIR", type=PATH, help="Write the pages as a static web site, too.")
 @options.ground_truth()
 @options.relations
 @click.option(
@@ -143,15 +153,29 @@ def batch(
 @options.limits("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
 @options.part()
 @options.threads
+@click.option("--ray", metavar="auto|ADDRESS", help="Compare on a Ray cluster that sees the same files.")
 @options.force("an existing comparison once the new one is complete")
-@click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
-def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_json: bool, **given: Any) -> None:
+@click.option("--json", "as_json", is_flag=True, help="Print table.json or overall.json instead of the table.")
+def compare(
+    logs: tuple[Source, ...],
+    methods: str | None,
+    out: Path | None,
+    site: Path | None,
+    ray: str | None,
+    as_json: bool,
+    **given: Any,
+) -> None:
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
     Writes tables, report.html and a rerun recording. Every method runs in its own process; one that crashes, hangs
     or runs out of memory becomes a row with the reason, and the exit code is 1. A verdict, also "not trustworthy",
     is a column and fails nothing. Our methods use no wheel odometry unless --odometry.prior is auto, since the
     others have none.
+
+    Several LOGs that are the parts of one drive are one log. Otherwise methods are compared on each, also of a
+    folder or a quoted pattern, and DIR gets a folder per log and the statistics over all: medians with confidence
+    intervals, wins, ranks. Called again, only the logs that have no result yet are compared. In --gt and
+    --relations {} stands for the name of the log. --ray and --site hold for one log, too.
 
     \b
     Methods:
@@ -183,20 +207,49 @@ def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_
       scanchain compare log.mcap --methods plicp,plicp-fine,mine --config mine.toml --gt truth.tum
       scanchain compare log.mcap --methods plicp,Mine --matcher mine:Mine
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --end 600
+      scanchain compare logs/ --methods plicp,svd,kiss --out runs/all --site public
+      scanchain compare 00.mcap 05.mcap 07.mcap --gt 'truth/{}.tum' --out runs/kitti
     """
+    from scanchain.batch.batch import on_cluster
+    from scanchain.batch.comparisons import attempt, compare_each, logs_of
     from scanchain.commands.terminal import Terminal
     from scanchain.comparison.compare import compare as run_comparison
+    from scanchain.comparison.methods import shared_settings
     from scanchain.comparison.table import TABLE_FILE, text
     from scanchain_viz.recording.results import present_comparison
 
-    out = out or Path("runs") / f"compare-{logs[0].stem}"
-    names = [name.strip() for name in (methods or "").split(",") if name.strip()]
+    of_log = (*shared_settings(given["config_file"]), *given["overrides"])
+    each = logs_of(logs, load_settings(overrides=of_log).config.log.format)
+    out = out or Path("runs") / f"compare-{logs[0].stem if len(each) == 1 else 'all'}"
+    given |= {
+        "methods": [name.strip() for name in (methods or "").split(",") if name.strip()],
+        "command": sys.argv,
+    }
     with Terminal("scans") as terminal:
-        compared = run_comparison(
-            logs, out, present_comparison, terminal, methods=names, command=sys.argv, **given
-        )
+        if len(each) > 1 or site is not None or ray is not None:
+            work = None if ray is None else on_cluster(ray, attempt, has_whole_node=True)
+            _end(compare_each(each, out, present_comparison, terminal, work=work, **given), out, site, as_json)
+            return
+        compared = run_comparison(each[0], out, present_comparison, terminal, **given)
     click.echo((compared.path / TABLE_FILE).read_text() if as_json else text(compared.table), nl=False)
     if not as_json:
         click.echo(f"written {out}: report.html, compare.rrd, tables")
     if compared.failures:
         raise ScanchainError(f"did not finish: {', '.join(compared.failures)}; see the table for the reason")
+
+
+def _end(overall: Overall, out: Path, site: Path | None, as_json: bool) -> None:
+    """Write the pages over all logs, print the table, and end with an error where something failed."""
+    from scanchain.batch.comparisons import publish
+    from scanchain.comparison.overall import OVERALL_FILE, overall_text
+    from scanchain_viz.report.overall import write_overall_report
+
+    write_overall_report(out, overall)
+    if site is not None:
+        publish(out, overall, site)
+    click.echo((out / OVERALL_FILE).read_text() if as_json else overall_text(overall), nl=False)
+    if not as_json:
+        of_site = "" if site is None else f"; {site}: index.html"
+        click.echo(f"written {out}: report.html, overall.csv, overall.md, a folder for each log{of_site}")
+    if overall.failures:
+        raise ScanchainError(f"{counted(len(overall.failures), 'failure')}; see the reasons above")

@@ -283,22 +283,30 @@ def _table(name: str, repeat: int, outcome: Outcome, assessed: Assessed, stamps_
     return pa.table(columns)
 
 
-def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Judged]:
+Apart = Mapping[str, Mapping[str, float]]  # by the names of two methods, meters between their trajectories
+
+
+def _apart(whole: Mapping[str, Outcome]) -> Apart:
+    """From the second scan on, as for the ATE."""
+    positions = {
+        name: each.trajectory.poses[min(1, len(each.trajectory) - 1) :, :-1, -1] for name, each in whole.items()
+    }
+    return {
+        name: {other: apart_m(each, positions[other]) for other in whole if other != name}
+        for name, each in positions.items()
+    }
+
+
+def judged(whole: Mapping[str, Outcome], scans: StoredScans, away_m: Apart) -> dict[str, Judged]:
     """The verdict on each whole run: on ours by all that is known, on others by wheels and constant velocity.
 
     The error of others is bounded by the wheels, or by the distance to one of ours plus its error bar, and is no
     less than the median distance to all others. Where the other trajectories contradict an error bar of ours, the
     verdict is to check it.
     """
-    whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
     found = {name: judge_run(each.folder) for name, each in whole.items() if (each.folder / STEPS_FILE).exists()}
     expected = {
         name: error for name in found if (error := known_of_run(whole[name].folder).expected_ate_m) is not None
-    }
-    positions = {name: each.trajectory.poses[:, :-1, -1] for name, each in whole.items()}
-    away_m = {
-        name: {other: apart_m(each, positions[other]) for other in whole if other != name}
-        for name, each in positions.items()
     }
     for name, error in expected.items():
         if found[name].verdict is Verdict.TRUSTWORTHY and (why := _contradiction(name, error, expected, away_m)):
@@ -316,10 +324,7 @@ def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Jud
     return found
 
 
-def _contradiction(
-    name: str, error: ExpectedError, expected: Mapping[str, ExpectedError],
-    away_m: Mapping[str, Mapping[str, float]],
-) -> str:  # fmt: skip
+def _contradiction(name: str, error: ExpectedError, expected: Mapping[str, ExpectedError], away_m: Apart) -> str:
     """Why the other trajectories contradict an error bar: another's that excludes it, or several that agree."""
     for other, bar in expected.items():
         if other != name and away_m[name][other] > error.high + bar.high:
@@ -351,7 +356,11 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
         others_m = np.delete(apart_m[place], place)
         if np.isfinite(others_m).any():
             more[name]["disagreement_m"] = float(np.nanmedian(others_m))
-    judgments = judged(chosen, scans)
+    whole = {name: outcome for name, outcome in chosen.items() if outcome.is_whole}
+    away_m = _apart(whole)
+    for name, others in away_m.items():
+        more[name]["apart_m"] = float(np.median(list(others.values()))) if others else None
+    judgments = judged(whole, scans, away_m)
     for name, judgment in judgments.items():
         ate_m = results.assessed[name].figures.get("ate_m")
         if judgment.verdict is Verdict.TRUSTWORTHY and ate_m is not None and ate_m > judgment.bound_m:

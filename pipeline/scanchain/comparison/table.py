@@ -56,12 +56,15 @@ class Column(Struct, frozen=True):
         value = figures.get(self.key)
         return None if value is None else self.scale * value
 
+    def digits_of(self, values: Sequence[float]) -> int:
+        """Digits of shown values: as many as the smallest needs for three figures."""
+        sizes = [abs(value) for value in values if value]
+        return min(self.digits, max(0, 2 - math.floor(math.log10(min(sizes))))) if sizes else self.digits
+
     def cells(self, rows: Sequence[Figures]) -> list[Shown]:
         """The figures of a table's rows; none is the best where all that are known are equal as text."""
         values = [self.of(row) for row in rows]
-        sizes, digits = [abs(value) for value in values if value], self.digits
-        if sizes:  # as many as the smallest needs for three figures
-            digits = min(digits, max(0, 2 - math.floor(math.log10(min(sizes)))))
+        digits = self.digits_of([value for value in values if value is not None])
         sign = {"low": 1.0, "high": -1.0, "": 0.0}[self.better]
         badness = [None if value is None else sign * round(value, digits) for value in values]
         known = {each for each in badness if each is not None}
@@ -101,6 +104,8 @@ COLUMNS = (
     Column("thickness_m", "surfaces", "mm", 1e3, 2, "low", "summary",
         "thickness of the map's surfaces; needs no ground truth"),
     Column("entropy", "entropy", "nats", 1.0, 3, "low", "accuracy", "mean map entropy; needs no ground truth"),
+    Column("apart_m", "apart", "m", 1.0, 4, "", "summary",
+        "median distance of the trajectory to those of the other methods, rmse as for the ATE"),
     Column("disagreement_m", "to others", "mm", 1e3, 1, "", "summary",
         "median distance of a motion to that of the other methods"),
     Column("median_s", "time", "ms", 1e3, 2, "low", "summary", "median time of a scan, all but the first"),
@@ -250,12 +255,9 @@ def text(table: Table) -> str:
     tried = [place for place, row in enumerate(table.rows) if row.status is not Status.MISSING]
     rows = [table.rows[place] for place in tried]
     names = [row.name if row.status is Status.OK else f"{row.name}: {row.status}" for row in rows]
-    names = ["method", "", *names]
-    lines = [f"{name:<{max(map(len, names))}}" for name in names]
-    for column, cells in zip(columns, shown, strict=True):
-        cells = [cells[place] for place in tried]
-        texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
-        lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
+    marked = [[cells[place].text + (" ", "*")[cells[place].is_best] for place in tried] for cells in shown]
+    heads = [[column.head, column.unit] for column in columns]
+    lines = lined_up([["method", "", *names], *(head + cells for head, cells in zip(heads, marked, strict=True))])
     best = "* best of its column. " if any(cell.is_best for cells in shown for cell in cells) else ""
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in rows if row.status is not Status.OK]
     if missing := [row for row in table.rows if row.status is Status.MISSING]:
@@ -263,5 +265,14 @@ def text(table: Table) -> str:
         endings += [f"not installed: {', '.join(row.name for row in missing)}; {' and '.join(commands)}"]
     endings += [f"{row.name}: {row.sentence if row.is_doubted else row.vouched}" for row in rows if row.verdict]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
-    known = [line.rstrip() for line in lines]
-    return "\n".join([*known, *map(folded, (f"{best}{table.against}", *endings))]) + "\n"
+    return "\n".join([*lines, *map(folded, (f"{best}{table.against}", *endings))]) + "\n"
+
+
+def lined_up(columns: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of columns of text, the first flush left, the others flush right."""
+    first, *others = columns
+    lines = [f"{text:<{max(map(len, first))}}" for text in first]
+    for column in others:
+        width = max(map(len, column))
+        lines = [f"{line}  {text:>{width}}" for line, text in zip(lines, column, strict=True)]
+    return [line.rstrip() for line in lines]

@@ -80,7 +80,7 @@ class Plot:
 
     A PNG contains only its lines, marks and images.
 
-    logarithmic : the axis with a logarithmic scale, "x" or "y"
+    logarithmic : the axes with a logarithmic scale, "x", "y" or "xy"
     height_inches : of the whole figure
     is_wide : across the whole width of the page
     """
@@ -94,8 +94,8 @@ class Plot:
         height_inches: float = 2.7,
         is_wide: bool = False,
     ) -> None:
-        self.x = Axis(x_label, is_logarithmic=logarithmic == "x")
-        self.y = Axis(y_label, is_logarithmic=logarithmic == "y")
+        self.x = Axis(x_label, is_logarithmic="x" in logarithmic)
+        self.y = Axis(y_label, is_logarithmic="y" in logarithmic)
         self.has_grid = True
         self.height_inches, self.is_wide, self.proportions = height_inches, is_wide, (0.0, 0.0)  # of a plan
         self._within: list[Callable[[], str]] = []

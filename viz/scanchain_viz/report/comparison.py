@@ -49,6 +49,8 @@ def write_compare_report(directory: Path) -> None:
         notes=table.notes,
         sections=list(_sections(directory, table, trajectories, truth)),
         collapsibles=list(_collapsibles(directory, table)),
+        links=[("compare.rrd", "recording for rerun"), ("table.csv", "table.csv")],
+        is_sortable=True,
     )
     page.write_page(directory, whole)
 

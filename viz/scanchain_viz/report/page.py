@@ -25,6 +25,7 @@ from scanchain_viz.pictures.trajectories import DrawnTrajectory
 REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"
 SCRIPT = (_TEMPLATES / "map_viewer.js").read_text(encoding="utf-8")
+_SORTING = (_TEMPLATES / "sorting.js").read_text(encoding="utf-8")
 MAX_ROWS = 100  # largest number of rows of a table; the longest segments or largest clusters are kept
 _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000  # largest number of points of a line: 0.03 MB of a page
@@ -157,6 +158,7 @@ class Collapsible:
 class Page:
     """A report; ``facts`` are label and value, ``warnings`` stand out, ``notes`` do not.
 
+    ``links`` : relative address and text; ``is_sortable`` : whether a click on a column's head sorts its table
     ``judged`` : the verdict, at the top; ``refuted`` : how the ground truth contradicts it, in red
     """
 
@@ -169,10 +171,12 @@ class Page:
     collapsibles: Sequence[Collapsible] = ()
     judged: Judged | None = None
     refuted: str = ""
+    links: Sequence[tuple[str, str]] = ()
+    is_sortable: bool = False
 
 
 def write_page(folder: Path, page: Page) -> None:
-    """Write report.html; all text in it is escaped, and it may load nothing and run nothing but its script."""
+    """Write report.html; all text in it is escaped, and it may load nothing and run nothing but its scripts."""
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -181,10 +185,10 @@ def write_page(folder: Path, page: Page) -> None:
         lstrip_blocks=True,
     )
     is_scripted = any(drawing.is_scripted for section in page.sections for drawing in section.drawings)
-    digest = b64encode(sha256(SCRIPT.encode()).digest()).decode("ascii")
-    may_run = f"script-src 'sha256-{digest}'" if is_scripted else ""
-    script = Markup(SCRIPT if is_scripted else "")
-    text = environment.get_template("report.html").render(page=page, may_run=may_run, script=script)
+    scripts = [Markup(SCRIPT)] * is_scripted + [Markup(_SORTING)] * page.is_sortable
+    digests = [b64encode(sha256(each.encode()).digest()).decode("ascii") for each in scripts]
+    may_run = " ".join(["script-src", *(f"'sha256-{digest}'" for digest in digests)]) if digests else ""
+    text = environment.get_template("report.html").render(page=page, may_run=may_run, scripts=scripts)
     write_whole(folder / REPORT_FILE, text.encode())
 
 

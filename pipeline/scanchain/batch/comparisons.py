@@ -1,0 +1,149 @@
+"""Comparisons on several logs, each in a folder of its own, which is kept when called again; and their site."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from scanchain.batch.batch import check_out, collect
+from scanchain.batch.task import key_of
+from scanchain.comparison.compare import compare
+from scanchain.comparison.methods import shared_settings
+from scanchain.comparison.overall import OVERALL_FILE, ComparedLog, Overall, overall_of, write_overall
+from scanchain.comparison.table import TABLE_FILE, read_table
+from scanchain.errors import InputError, ScanchainError, spelled
+from scanchain.files import Source, write_whole
+from scanchain.logs.messages.readers import is_lidar
+from scanchain.logs.opening import index_files
+from scanchain.logs.stream import are_parts
+from scanchain.runs.job import Progress
+from scanchain.runs.provenance import identity_of
+
+_RECORDING, _REPORT, _INDEX = "compare.rrd", "report.html", "index.html"
+_OF_LOG = _REPORT, _RECORDING, TABLE_FILE, "table.csv", "table.md"  # what a site has of each log
+_OF_ALL = OVERALL_FILE, "overall.csv", "overall.md"
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A log to compare methods on: its files, its folder, and the arguments of ``compare``."""
+
+    files: tuple[Source, ...]
+    folder: Path
+    present: Callable[[Path], None]
+    given: dict[str, Any]
+
+
+Work = Callable[[Sequence[Task]], Iterator[tuple[Task, str]]]
+
+
+def attempt(task: Task, progress: Progress | None = None) -> tuple[Task, str]:
+    """Compare on a log; with the reason why there is no result, which is empty where there is one."""
+    try:
+        compare(task.files, task.folder, task.present, progress or Progress(), force=True, **task.given)
+    except ScanchainError as error:
+        return task, error.text.removeprefix(f"{task.files[0]}: ")
+    if progress is not None and progress.stopped:  # the table of a part of the log is no result
+        shutil.rmtree(task.folder)
+        raise KeyboardInterrupt
+    return task, ""
+
+
+def logs_of(named: Sequence[Source], log_format: str) -> list[tuple[Source, ...]]:
+    """The files of each log: of one where all are its parts, else each file, folder or match of a pattern is one.
+
+    Raises InputError for a pattern that matches nothing.
+    """
+    found = collect(named, (), log_format)
+    return [found] if len(found) > 1 and _are_of_one(found) else [(each,) for each in found]
+
+
+def _are_of_one(files: Sequence[Source]) -> bool:
+    """True for files of one drive that share a lidar topic, as far as they have any."""
+    try:
+        indexes = index_files(files)
+    except InputError:  # the log that cannot be read becomes a row that says so
+        return False
+    topics = [{each.topic for each in index.channels.values() if is_lidar(each)} for index in indexes]
+    return any(topics) and bool(set.intersection(*filter(None, topics))) and are_parts(indexes)
+
+
+def compare_each(
+    logs: Sequence[tuple[Source, ...]],
+    out: Path,
+    present: Callable[[Path], None],
+    progress: Progress,
+    *,
+    work: Work | None = None,
+    force: bool = False,
+    **given: Any,
+) -> Overall:
+    """Compare methods on each log that has no result in ``out`` yet, and write the statistics over all.
+
+    present, given : as of ``compare``; in the file of true poses or relations {} stands for the name of the log
+    work : where it is done; None for this process, one log after the other, so that times are comparable
+    force : whether results of earlier calls are replaced
+    On Ctrl-C the log in progress is given up, and those not begun are listed as such. A log that cannot be read is
+    listed with the reason. Raises InputError for a directory that holds something else.
+    """
+    check_out(out, [file for files in logs for file in files], "a comparison of several logs", OVERALL_FILE)
+    out.mkdir(parents=True, exist_ok=True)
+    tasks = [_task(files, out, present, given) for files in logs]
+    reasons = {task.folder: "not compared: stopped by the user" for task in tasks}
+    waiting = [task for task in tasks if force or not (task.folder / TABLE_FILE).is_file()]
+    if kept := len(tasks) - len(waiting):
+        progress.announce(f"{kept:,} of {len(tasks):,} logs are compared already")
+    if not (out / OVERALL_FILE).exists():  # marks the directory, before a kill too
+        write_overall(out, overall_of([]))
+    try:
+        for task, reason in (work or partial(map, partial(attempt, progress=progress)))(waiting):
+            reasons[task.folder] = reason
+            progress.announce(f"{task.folder.name}: {reason or 'compared'}")
+    except KeyboardInterrupt:
+        progress.announce("stopped; the same command continues")
+    overall = overall_of([_compared(task, reasons[task.folder]) for task in tasks])
+    write_overall(out, overall)
+    return overall
+
+
+def _task(files: tuple[Source, ...], out: Path, present: Callable[[Path], None], given: dict[str, Any]) -> Task:
+    stem, own = files[0].resolve().stem, dict(given)
+    for key in ("ground_truth", "relations"):
+        if given.get(key) is not None:
+            own[key] = Path(str(given[key]).replace("{}", stem))
+    identity = [identity_of(file) or spelled(str(file)) for file in files]
+    file = given.get("config_file")
+    key = key_of("\0".join(identity), None, (*shared_settings(file), *given.get("overrides", ())))
+    rest = {name: value for name, value in own.items() if name not in ("overrides", "command", "config_file")}
+    text = f"{key} {sorted(rest.items())} {'' if file is None else file.read_text(encoding='utf-8')}"
+    return Task(files, out / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:8]}", present, own)
+
+
+def _compared(task: Task, reason: str) -> ComparedLog:
+    is_done = (task.folder / TABLE_FILE).is_file()
+    name, folder = task.files[0].name, task.folder.name
+    return ComparedLog(name, folder, read_table(task.folder) if is_done else None, "" if is_done else reason)
+
+
+def publish(out: Path, overall: Overall, site: Path) -> None:
+    """Copy pages, recordings and tables into a folder that a web server can serve as it is.
+
+    Raises InputError for a folder that holds something else.
+    """
+    if site.exists() and not (site.is_dir() and (not any(site.iterdir()) or (site / _INDEX).is_file())):
+        raise InputError(f"{site}: exists and is not a site of comparisons; choose another --site")
+    site.mkdir(parents=True, exist_ok=True)
+    for log in overall.logs:
+        shutil.rmtree(site / log.folder, ignore_errors=True)
+        if log.table is not None:
+            (site / log.folder).mkdir()
+            for file in _OF_LOG:
+                shutil.copy(out / log.folder / file, site / log.folder / file)
+    for file in _OF_ALL:
+        shutil.copy(out / file, site / file)
+    write_whole(site / _INDEX, (out / _REPORT).read_bytes())
