@@ -88,7 +88,7 @@ def compare_each(
     present, given : as of ``compare``; in the file of true poses or relations {} stands for the name of the log
     work : where it is done; None for this process, one log after the other, so that times are comparable
     force : whether results of earlier calls are replaced
-    On Ctrl-C the log in progress is given up, and those not begun are listed as such. A log that cannot be read is
+    On Ctrl-C the log in progress is discarded, and those not begun are listed as such. A log that cannot be read is
     listed with the reason. Raises InputError for a directory that holds something else.
     """
     check_out(out, [file for files in logs for file in files], "a comparison of several logs", OVERALL_FILE)
