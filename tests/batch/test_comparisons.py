@@ -3,18 +3,21 @@
 import json
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 
 from scanchain.__main__ import main
 from scanchain.batch.comparisons import compare_each, logs_of, publish
+from scanchain.comparison.methods import Variation, resolve
 from scanchain.comparison.overall import OVERALL_FILE
-from scanchain.comparison.table import TABLE_FILE
+from scanchain.comparison.table import TABLE_FILE, read_table
 from scanchain.errors import InputError
 from scanchain.runs.job import Progress
 from tests.support import made
 from tests.support.browser import look
 from tests.support.in_process import here
+from tests.support.messages import unfolded
 
 MINE = '[mine]\nmethod = "bad_odometries:Shifted"\n[other]\nmethod = "bad_odometries:Shifted"\nstep_m = 0.2\n'
 
@@ -208,3 +211,56 @@ def test_a_click_on_a_head_sorts_its_table(site, tmp_path):
     (first,) = (line for line in look(page, tmp_path, width=1280)["text"].splitlines() if "descending" in line)
     rising, falling, _ = first.split("; ")
     assert {rising, falling} == {"mine other", "other mine"}
+
+
+def test_a_setting_is_varied_for_the_methods_that_have_it(logs, tmp_path, settings, capfd):
+    words = ["compare", str(logs[0]), "--methods", "mine,other", "--config", str(settings)]
+    words += ["--vary", "step_m=0.1,0.3", "--vary", "every=1,2", "--out", str(tmp_path / "out")]
+    assert main([*words, "--site", str(tmp_path / "site")]) == 0
+    said = capfd.readouterr().out
+    steps, every = (
+        re.search(rf"\n({key} .*\n)(.*\n)+?(?=\n|written)", said)[0].split("\n") for key in ("step_m", "every")
+    )
+    assert steps[1].split() == ["step_m", "other"]  # which alone has it in its table
+    assert every[1].split() == ["every", "mine", "other"] and [line.split()[0] for line in every[3:5]] == [
+        "1",
+        "2",
+    ]
+    (finer,) = (read_table(path.parent) for path in (tmp_path / "out/vary/every=2").glob(f"*/{TABLE_FILE}"))
+    assert finer.scans == 40
+    (changed,) = (read_table(path.parent) for path in (tmp_path / "out/vary/step_m=0.3").glob(f"*/{TABLE_FILE}"))
+    assert [(row.name, row.settings) for row in changed.rows] == [("other", {"step_m": 0.3})]
+    links = re.findall(r'<a href="(vary[^"]+)"', (tmp_path / "site/index.html").read_text())
+    assert len(links) == 4 and all((tmp_path / "site" / unquote(link)).is_file() for link in links)
+    assert main(words) == 0 and "compared already" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--vary", "every"], "--vary every: wanted KEY=VALUE,VALUE, as --vary every=1,2,5"),
+        (["--vary", "nothing=1"], "--vary nothing: none of plicp, svd has such a setting"),
+        (
+            ["--vary", "max_iterations=5"],
+            "--vary max_iterations: there are several, matching.max_iterations and graph",
+        ),
+        (["--vary", "every=0"], "--vary every: log.every is 0; it must be a whole number >= 1"),
+    ],
+)
+def test_a_variation_that_is_none_is_refused_by_name(logs, tmp_path, capfd, words, complaint):
+    code = main(["compare", str(logs[0]), "--methods", "plicp,svd", "--out", str(tmp_path / "out"), *words])
+    said = "".join(capfd.readouterr())
+    assert complaint in unfolded(said) and code in (1, 2)
+    assert code == 1 or not (tmp_path / "out").exists()  # before anything is run
+
+
+def test_variations_hold_for_ours_and_for_baselines_by_the_same_name():
+    methods = resolve(
+        ("plicp", "kiss-icp", "genz-icp", "plicp+loops"), 3, file=None, variation=Variation("voxel_size_m", "0.5")
+    )
+    assert [method.name for method in methods] == ["plicp", "kiss-icp", "plicp+loops"]
+    assert methods[0].settings["local_map"]["voxel_size_m"] == methods[1].settings["voxel_size_m"] == 0.5
+    (fewer,) = resolve(("plicp", "small-gicp"), 3, file=None, variation=Variation("neighbors", "7"))
+    assert (fewer.name, fewer.settings["neighbors"]) == ("small-gicp", 7)
+    with pytest.raises(InputError, match=r"--vary neighbors: .*its keys are"):
+        resolve(("small-gicp",), 3, file=None, variation=Variation("neighbors", '"many"'))

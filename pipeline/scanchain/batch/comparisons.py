@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,17 +13,25 @@ from typing import Any
 from scanchain.batch.batch import check_out, collect
 from scanchain.batch.task import key_of
 from scanchain.comparison.compare import compare
-from scanchain.comparison.methods import shared_settings
-from scanchain.comparison.overall import OVERALL_FILE, ComparedLog, Overall, overall_of, write_overall
+from scanchain.comparison.methods import Variation, shared_settings
+from scanchain.comparison.overall import (
+    OVERALL_FILE,
+    ComparedLog,
+    Overall,
+    overall_of,
+    variation_folder,
+    write_overall,
+)
 from scanchain.comparison.table import TABLE_FILE, read_table
 from scanchain.errors import InputError, ScanchainError, spelled
-from scanchain.files import Source, write_whole
+from scanchain.files import Source
 from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.opening import index_files
 from scanchain.logs.stream import are_parts
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import identity_of
 
+_STOPPED = "not compared: stopped by the user"
 _RECORDING, _REPORT, _INDEX = "compare.rrd", "report.html", "index.html"
 _OF_LOG = _REPORT, _RECORDING, TABLE_FILE, "table.csv", "table.md"  # what a site has of each log
 _OF_ALL = OVERALL_FILE, "overall.csv", "overall.md"
@@ -88,13 +96,13 @@ def compare_each(
     present, given : as of ``compare``; in the file of true poses or relations {} stands for the name of the log
     work : where it is done; None for this process, one log after the other, so that times are comparable
     force : whether results of earlier calls are replaced
-    On Ctrl-C the log in progress is discarded, and those not begun are listed as such. A log that cannot be read is
-    listed with the reason. Raises InputError for a directory that holds something else.
+    On Ctrl-C the log in progress is discarded, and those not begun are listed as such. A log that cannot be read
+    is listed with the reason. Raises InputError for a directory that holds something else.
     """
     check_out(out, [file for files in logs for file in files], "a comparison of several logs", OVERALL_FILE)
     out.mkdir(parents=True, exist_ok=True)
     tasks = [_task(files, out, present, given) for files in logs]
-    reasons = {task.folder: "not compared: stopped by the user" for task in tasks}
+    reasons = {task.folder: _STOPPED for task in tasks}
     waiting = [task for task in tasks if force or not (task.folder / TABLE_FILE).is_file()]
     if kept := len(tasks) - len(waiting):
         progress.announce(f"{kept:,} of {len(tasks):,} logs are compared already")
@@ -109,6 +117,23 @@ def compare_each(
     overall = overall_of([_compared(task, reasons[task.folder]) for task in tasks])
     write_overall(out, overall)
     return overall
+
+
+def vary_each(
+    variations: Mapping[str, Sequence[str]], out: Path, overall: Overall, compared: Callable[..., Overall]
+) -> dict[str, dict[str, Overall]]:
+    """Compare with each value of each key in turn: the statistics by key and value, up to where the user stops.
+
+    overall : of all logs with the usual values
+    compared : ``compare_each`` of a directory and a ``variation``
+    """
+    found: dict[str, dict[str, Overall]] = {key: {} for key in variations}
+    for key, value in [(key, value) for key, values in variations.items() for value in values]:
+        if any(log.reason == _STOPPED for log in overall.logs):
+            break
+        overall = compared(out / variation_folder(key, value), variation=Variation(key, value))
+        found[key][value] = overall
+    return {key: by_value for key, by_value in found.items() if by_value}
 
 
 def _task(files: tuple[Source, ...], out: Path, present: Callable[[Path], None], given: dict[str, Any]) -> Task:
@@ -146,4 +171,5 @@ def publish(out: Path, overall: Overall, site: Path) -> None:
                 shutil.copy(out / log.folder / file, site / log.folder / file)
     for file in _OF_ALL:
         shutil.copy(out / file, site / file)
-    write_whole(site / _INDEX, (out / _REPORT).read_bytes())
+    for name in (_INDEX, _REPORT):  # variations link to the latter
+        shutil.copy(out / _REPORT, site / name)

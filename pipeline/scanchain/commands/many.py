@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +20,20 @@ from scanchain.settings import Override, load_settings
 if TYPE_CHECKING:
     from scanchain.comparison.overall import Overall
 
+Varied = Mapping[str, Mapping[str, "Overall"]]  # by key and value of --vary
 _DAY_S = 86_400.0  # time limit of a log where none is given
+
+
+def _variations(_: object, __: object, words: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Keys and values of ``--vary``."""
+    found = []
+    for word in words:
+        key, values = word.partition("=")[::2]
+        listed = [value.strip() for value in values.split(",") if value.strip()]
+        if not listed:
+            raise InputError(f"--vary {word}: wanted KEY=VALUE,VALUE, as --vary every=1,2,5")
+        found.append((key.removeprefix("--").strip(), listed))
+    return found
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
@@ -153,6 +168,13 @@ def batch(
 @options.limits("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
 @options.part()
 @options.threads
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="KEY=A,B,C",
+    callback=_variations,
+    help="Compare with each of these values, too: robustness to a setting or rate.",
+)
 @click.option("--ray", metavar="auto|ADDRESS", help="Compare on a Ray cluster that sees the same files.")
 @options.force("an existing comparison once the new one is complete")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json or overall.json instead of the table.")
@@ -162,6 +184,7 @@ def compare(
     out: Path | None,
     site: Path | None,
     ray: str | None,
+    vary: list[tuple[str, list[str]]],
     as_json: bool,
     **given: Any,
 ) -> None:
@@ -175,7 +198,8 @@ def compare(
     Several LOGs that are the parts of one drive are one log. Otherwise methods are compared on each, also of a
     folder or a quoted pattern, and DIR gets a folder per log and the statistics over all: medians with confidence
     intervals, wins, ranks. Called again, only the logs that have no result yet are compared. In --gt and
-    --relations {} stands for the name of the log. --ray and --site hold for one log, too.
+    --relations {} stands for the name of the log. --ray, --site and --vary hold for one log, too. KEY of --vary is
+    one of the configuration or of a method, or the last part of it; it is set for all methods that have it.
 
     \b
     Methods:
@@ -208,27 +232,33 @@ def compare(
       scanchain compare log.mcap --methods plicp,Mine --matcher mine:Mine
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --end 600
       scanchain compare logs/ --methods plicp,svd,kiss --out runs/all --site public
+      scanchain compare log.mcap --methods plicp,kiss --vary voxel_size_m=0.5,1,2 --vary every=1,2,5
       scanchain compare 00.mcap 05.mcap 07.mcap --gt 'truth/{}.tum' --out runs/kitti
     """
     from scanchain.batch.batch import on_cluster
-    from scanchain.batch.comparisons import attempt, compare_each, logs_of
+    from scanchain.batch.comparisons import attempt, compare_each, logs_of, vary_each
     from scanchain.commands.terminal import Terminal
     from scanchain.comparison.compare import compare as run_comparison
-    from scanchain.comparison.methods import shared_settings
+    from scanchain.comparison.methods import Variation, shared_settings
     from scanchain.comparison.table import TABLE_FILE, text
     from scanchain_viz.recording.results import present_comparison
 
     of_log = (*shared_settings(given["config_file"]), *given["overrides"])
     each = logs_of(logs, load_settings(overrides=of_log).config.log.format)
+    for key, value in ((key, value) for key, values in vary for value in values):  # refused before anything is run
+        load_settings(overrides=(*of_log, *Variation(key, value).overrides))
     out = out or Path("runs") / f"compare-{logs[0].stem if len(each) == 1 else 'all'}"
     given |= {
         "methods": [name.strip() for name in (methods or "").split(",") if name.strip()],
         "command": sys.argv,
     }
     with Terminal("scans") as terminal:
-        if len(each) > 1 or site is not None or ray is not None:
+        if len(each) > 1 or site is not None or ray is not None or vary:
             work = None if ray is None else on_cluster(ray, attempt, has_whole_node=True)
-            _end(compare_each(each, out, present_comparison, terminal, work=work, **given), out, site, as_json)
+            given |= {"present": present_comparison, "progress": terminal, "work": work}
+            overall = compare_each(each, out, **given)
+            varied = vary_each(dict(vary), out, overall, partial(compare_each, each, **given))
+            _end(overall, varied, out, site, as_json)
             return
         compared = run_comparison(each[0], out, present_comparison, terminal, **given)
     click.echo((compared.path / TABLE_FILE).read_text() if as_json else text(compared.table), nl=False)
@@ -238,18 +268,24 @@ def compare(
         raise ScanchainError(f"did not finish: {', '.join(compared.failures)}; see the table for the reason")
 
 
-def _end(overall: Overall, out: Path, site: Path | None, as_json: bool) -> None:
+def _end(overall: Overall, varied: Varied, out: Path, site: Path | None, as_json: bool) -> None:
     """Write the pages over all logs, print the table, and end with an error where something failed."""
     from scanchain.batch.comparisons import publish
-    from scanchain.comparison.overall import OVERALL_FILE, overall_text
+    from scanchain.comparison.overall import OVERALL_FILE, overall_text, sensitivity_text, variation_folder
     from scanchain_viz.report.overall import write_overall_report
 
-    write_overall_report(out, overall)
-    if site is not None:
-        publish(out, overall, site)
-    click.echo((out / OVERALL_FILE).read_text() if as_json else overall_text(overall), nl=False)
+    folders = {"": overall}
+    folders |= {
+        variation_folder(key, value): each for key, found in varied.items() for value, each in found.items()
+    }
+    for folder, each in folders.items():
+        write_overall_report(out / folder, each, {} if folder else varied)
+        if site is not None:
+            publish(out / folder, each, site / folder)
+    texts = [overall_text(overall), *(sensitivity_text(key, found) for key, found in varied.items())]
+    click.echo((out / OVERALL_FILE).read_text() if as_json else "\n".join(texts), nl=False)
     if not as_json:
         of_site = "" if site is None else f"; {site}: index.html"
         click.echo(f"written {out}: report.html, overall.csv, overall.md, a folder for each log{of_site}")
-    if overall.failures:
-        raise ScanchainError(f"{counted(len(overall.failures), 'failure')}; see the reasons above")
+    if failures := sum(len(each.failures) for each in folders.values()):
+        raise ScanchainError(f"{counted(failures, 'failure')}; the table and its page have the reasons")

@@ -11,7 +11,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.ahead import compile_ahead
-from scanchain.comparison.methods import default_names, resolve, shared_settings
+from scanchain.comparison.methods import Variation, default_names, resolve, shared_settings
 from scanchain.comparison.processes import StoredScans, run_all, store
 from scanchain.comparison.results import Reference, results_of, summarize, write_results
 from scanchain.comparison.table import Table, write_table
@@ -62,6 +62,7 @@ def compare(
     memory_mib: float | None = None,
     force: bool = False,
     command: Sequence[str] = (),
+    variation: Variation | None = None,
 ) -> Compared:
     """Run methods on a log and write the directory ``out``; ``present`` adds report and recording to it.
 
@@ -71,15 +72,18 @@ def compare(
     ground_truth : a TUM or KITTI file; None for the log's own
     repeat : runs of every method, interleaved
     time_s, memory_mib : limits of a run; None for the default ones
+    variation : a setting with another value, for the methods that have it
     Raises InputError for bad input before anything is run.
     """
     directory = RunDirectory(out, force=force, sources=logs, command=command)
-    of_log = (*shared_settings(config_file), *overrides)
+    of_log = (*shared_settings(config_file), *overrides, *(variation.overrides if variation else ()))
     log = open_log(logs, load_settings(overrides=of_log).config.log)
     choose_point_times(log)
     settings = load_settings(log.dimension, overrides=of_log)
     names = methods or default_names(log.dimension, has_imu=log.imu is not None)
-    chosen = resolve(names, log.dimension, file=config_file, overrides=overrides, matcher=matcher)
+    chosen = resolve(
+        names, log.dimension, file=config_file, overrides=overrides, matcher=matcher, variation=variation
+    )
     with directory:
         directory.begin(", ".join(method.name for method in chosen))
         if any(method.is_ours for method in chosen):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import Struct
@@ -15,7 +16,7 @@ from scanchain.config import MATCHERS, Config
 from scanchain.errors import InputError
 from scanchain.plugins import is_class_name
 from scanchain.registration import create_matcher
-from scanchain.settings import Override, leaves, load_settings, read_toml
+from scanchain.settings import Override, config_keys, leaves, load_settings, read_toml
 
 _ANY = "matcher"  # ours with the matcher that the settings name
 _VARIANTS = ("", "+loops", "+imu")  # of ours
@@ -45,6 +46,41 @@ class Method(Struct, frozen=True):
         return self.base in OURS
 
 
+class Variation(NamedTuple):
+    """A setting with another value, for all methods that have it; those without it are left out.
+
+    key : of the configuration, or the last part of one, which is that of a method or of the log
+    """
+
+    key: str
+    value: str
+
+    @property
+    def overrides(self) -> tuple[Override, ...]:
+        """What it sets for the log and for ours; none where only other methods have the key."""
+        found = [key for key in config_keys() if self.key in (key, key.rpartition(".")[2])]
+        own = [key for key in found if key.partition(".")[0] not in _SHARED] or found
+        if len(own) > 1:
+            raise InputError(f"--vary {self.key}: there are several, {' and '.join(own)}; give one of them")
+        return tuple(Override(key, self.value, f"--vary {self.key}") for key in own)
+
+    def of(self, method: Method, dimension: int) -> Method | None:
+        """The method with this setting, None for one that has no such key."""
+        keys = [each.key for each in self.overrides]
+        if method.is_ours or any(key.startswith("log.") for key in keys):
+            return method if keys else None
+        if self.key not in method.settings:
+            return None
+        value = tomllib.loads(f"value = {self.value}")["value"]
+        own = method.settings | {self.key: value}
+        return msgspec.structs.replace(
+            method,
+            settings=_their_settings(method.name, method.base, own, dimension, f"--vary {self.key}")
+            if method.base in BASELINES
+            else own,
+        )
+
+
 def default_names(dimension: int, *, has_imu: bool = False) -> tuple[str, ...]:
     """Methods that apply to logs of this dimension, with or without an IMU."""
     others = [name for name, entry in BASELINES.items() if name not in _ON_REQUEST and has_imu >= entry.wants_imu]
@@ -60,12 +96,14 @@ def resolve(
     file: Path | None,
     overrides: Sequence[Override] = (),
     matcher: str = "",
+    variation: Variation | None = None,
 ) -> tuple[Method, ...]:
     """The methods of these names, settings checked.
 
     file : TOML, one table a method; a table of another name is a variant of the one that its key ``method`` names
     overrides : keys of the configuration, for all of ours; sections of it in ``file`` are ``shared_settings``
     matcher : one that is compared as well; ours with MODULE:CLASS are called CLASS, CLASS+loops and CLASS+imu
+    variation : of those that have the setting, the others are left out
     Raises InputError for an unknown name or key.
     """
     tables = {name: table for name, table in _tables(file).items() if name not in _SECTIONS}
@@ -91,8 +129,12 @@ def resolve(
             raise InputError(
                 f"{override.flag} distinguishes plicp, svd, +loops and +imu; choose by --methods or --matcher"
             )
-    ours = (shared_settings(file), overrides)
-    return tuple(_method(name, tables.get(name, {}), dimension, f"{file}: [{name}]", *ours) for name in names)
+    ours = (shared_settings(file), (*overrides, *(variation.overrides if variation else ())))
+    methods = [_method(name, tables.get(name, {}), dimension, f"{file}: [{name}]", *ours) for name in names]
+    varied = methods if variation is None else [variation.of(method, dimension) for method in methods]
+    if variation is not None and not any(varied):
+        raise InputError(f"--vary {variation.key}: none of {', '.join(names)} has such a setting")
+    return tuple(filter(None, varied))
 
 
 def shared_settings(file: Path | None) -> tuple[Override, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -277,3 +277,33 @@ def overall_text(overall: Overall) -> str:
     ]
     columns.append(["rank", "", *(each.shown_rank for each in standings)])
     return "\n".join([*lined_up(columns), *map(folded, overall.notes)]) + "\n"
+
+
+def variation_folder(key: str, value: str) -> str:
+    """Folder of the comparison with another value of a setting, within that of the comparison."""
+    return f"vary/{key}={value}"
+
+
+def sensitivity(varied: Mapping[str, Overall]) -> tuple[Column, list[str], Matrix]:
+    """Median accuracy by value of a setting (rows) and method (columns), NaN where a method did not finish.
+
+    The column is the ATE, over the path where all paths are long enough.
+    """
+    names = list(dict.fromkeys(each.name for overall in varied.values() for each in overall.standings))
+    by_value = [{each.name: each.figures for each in overall.standings} for overall in varied.values()]
+    ate, share = FIGURES[:2]
+    known = [figures for of_methods in by_value for figures in of_methods.values() if ate.key in figures]
+    column = share if all(share.key in figures for figures in known) else ate
+    medians = [[of_methods.get(name, {}).get(column.key) for name in names] for of_methods in by_value]
+    values = [[math.nan if each is None else column.scale * each.value for each in row] for row in medians]
+    return column, names, np.array(values).reshape(len(varied), len(names))
+
+
+def sensitivity_text(key: str, varied: Mapping[str, Overall]) -> str:
+    """Accuracy by value of a setting for a terminal."""
+    column, names, values = sensitivity(varied)
+    digits = column.digits_of(values[np.isfinite(values)].tolist())
+    columns = [[key, column.unit, *varied]]
+    for name, each in zip(names, values.T, strict=True):
+        columns.append([name, column.head, *("–" if math.isnan(x) else f"{x:.{digits}f}" for x in each)])
+    return "\n".join(lined_up(columns)) + "\n"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import starmap
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 
-from scanchain.comparison.overall import FIGURES, ComparedLog, Overall, Standing
+from scanchain.comparison.overall import FIGURES, ComparedLog, Overall, Standing, sensitivity, variation_folder
 from scanchain.comparison.processes import Status
 from scanchain.comparison.table import Column
 from scanchain.errors import counted
@@ -22,8 +23,10 @@ _BY_LOG = {"ate_m": "ATE", "apart_m": "Distance from the other methods", "median
 _MARK = 7.0  # points
 
 
-def write_overall_report(directory: Path, overall: Overall) -> None:
-    """Draw and write the page."""
+def write_overall_report(
+    directory: Path, overall: Overall, varied: Mapping[str, Mapping[str, Overall]] | None = None
+) -> None:
+    """Draw and write the page; ``varied`` are the statistics by key and value of a setting."""
     done = [log for log in overall.logs if log.table is not None]
     scans = sum(log.table.scans for log in done if log.table is not None)
     whole = page.Page(
@@ -35,7 +38,7 @@ def write_overall_report(directory: Path, overall: Overall) -> None:
             ("methods", f"{len(overall.standings)}"),
         ),
         warnings=[*overall.failures, *filter(None, (log.doubt for log in overall.logs))],
-        sections=list(_sections(overall)),
+        sections=[*_sections(overall), *starmap(_sensitivity, (varied or {}).items())],
         links=[(name, name) for name in ("overall.csv", "overall.md", "overall.json")],
         is_sortable=True,
     )
@@ -59,7 +62,7 @@ def _sections(overall: Overall) -> Iterator[Section]:
         ]
         yield Section("Intervals", text, grid=Grid(heads, rows))
     yield from _pictures(overall, chips)
-    if overall.ranked_logs:
+    if overall.ranked_logs > 1:
         heads = [Head("share of logs"), *(Head(each.name) for each in overall.standings)]
         rows = [
             Row(each.name, [page.figure(share, 100.0, 0) for share in shares], chip)
@@ -74,6 +77,34 @@ def _sections(overall: Overall) -> Iterator[Section]:
         if column.key in _BY_LOG and any(column.key in each.figures for each in overall.standings):
             text = f"{column.definition[0].upper()}{column.definition[1:]}."
             yield Section(f"{_BY_LOG[column.key]} by log [{column.unit}]", text, grid=_by_log(overall, column))
+
+
+def _sensitivity(key: str, varied: Mapping[str, Overall]) -> Section:
+    """Accuracy over the values of a setting, as picture and table."""
+    column, names, accuracy = sensitivity(varied)
+    chips = [Chip(name, color_of(place)) for place, name in enumerate(names)]
+    try:
+        places = np.array(list(varied), np.float64)
+    except ValueError:
+        places = np.arange(1.0, len(varied) + 1.0)
+    scale = "xy" if (places > 0.0).all() else "y"
+    figure = Plot(key, f"median {column.heading}", logarithmic=scale, is_wide=True)
+    for chip, values in zip(chips, accuracy.T, strict=True):
+        points = np.stack([places, values], axis=1)[np.argsort(places)]
+        figure.line(points, chip.color)
+        figure.marks(points, "o", chip.color, _MARK)
+    digits = column.digits_of(accuracy[np.isfinite(accuracy)].tolist())
+    rows = [
+        Row(
+            value,
+            [page.figure(each, 1.0, digits) for each in row],
+            link=quote(f"{variation_folder(key, value)}/{page.REPORT_FILE}"),
+        )
+        for value, row in zip(varied, accuracy.tolist(), strict=True)
+    ]
+    text = f"{column.heading} at each value, all else as above; medians over the logs. A value links to its page."
+    drawing = Drawing.of("Accuracy", "A gap where a method did not finish.", figure)
+    return Section(f"Sensitivity to {key}", text, chips, [drawing], Grid([Head(key), *map(Head, names)], rows))
 
 
 def _logs(overall: Overall) -> Grid:
