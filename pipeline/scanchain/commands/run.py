@@ -174,17 +174,20 @@ def check(
 @click.argument("directory", metavar="DIR", type=PATH)
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
 @click.option("--png", metavar="FILE", type=PATH, help="Draw trajectory, ground truth and map to a PNG instead.")
+@click.option("--gif", metavar="FILE", type=PATH, help="Draw the growing map to an animated GIF instead.")
 @options.force("an existing picture")
-def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
+def view(directory: Path, web: bool, png: Path | None, gif: Path | None, force: bool) -> None:
     """Open the recording of a run in the rerun viewer, or draw its map to a picture.
 
-    DIR is a directory of run, localize, merge or changes, or a .rrd file; a picture needs a trajectory.
+    DIR is a directory of run, localize, merge or changes, or a .rrd file; a picture needs a trajectory, an
+    animation (less than 3 MB) the keyframes of run or merge.
 
     \b
     Examples:
       scanchain view runs/log
       scanchain view runs/log --web
       scanchain view runs/log --png log.png
+      scanchain view runs/log --gif log.gif
     """
     from scanchain.commands.terminal import Terminal
 
@@ -194,6 +197,13 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
         options.check_output(png, force=force, endings=(".png",))
         draw_run(directory, png)
         click.echo(png)
+        return
+    if gif is not None:
+        from scanchain_viz.pictures.animation import draw_growing_map
+
+        options.check_output(gif, force=force, endings=(".gif",))
+        draw_growing_map(directory, gif)
+        click.echo(gif)
         return
     path = directory / "recording.rrd" if directory.is_dir() else directory
     if not path.exists() or path.suffix != ".rrd":

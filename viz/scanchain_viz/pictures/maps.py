@@ -77,15 +77,15 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
     return low, high
 
 
-def map_points(prior: SavedMap) -> Points:
-    """(N, 3) points sampled from all keyframes of a map, in its frame."""
+def map_points(prior: SavedMap) -> list[Points]:
+    """Points (M, 3) sampled from each keyframe of a map, in its frame."""
     each = max(_STYLE.most // max(len(prior.keyframes), 1), 1)
-    clouds = [np.empty((0, 3))]
+    clouds = []
     for keyframe in prior.keyframes:
         points = keyframe.points
         some = lie.transform(keyframe.T_odom_lidar, points[:: max(1, -(-len(points) // each))])
         clouds.append(lie.lift_points(some))
-    return np.vstack(clouds)
+    return clouds
 
 
 def over_map(
@@ -238,7 +238,7 @@ def draw_run(directory: Path, picture: Path) -> None:
             "open report.html"
         )
     if "placed" in metrics:  # over the map that it was localized in
-        points = map_points(open_saved_map(Path(metrics["map"])))
+        points = np.vstack(map_points(open_saved_map(Path(metrics["map"]))))
     else:
         points = read_ply(directory / "map.ply")
         if not points[:, 2].any():

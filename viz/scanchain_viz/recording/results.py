@@ -184,7 +184,7 @@ def _upright(angles_rad: Sequence[float] | NDArray[np.float64]) -> NDArray[np.fl
 def present_localization(directory: Path, localized: LocalizedLog) -> None:
     """Write report.html and recording.rrd: map, live pose, hypotheses while searching, state and final path."""
     maps.write_localization_report(directory, localized)
-    prior, points = localized.prior, drawing.in_space(map_points(localized.prior))
+    prior, points = localized.prior, drawing.in_space(np.vstack(map_points(localized.prior)))
     side = rrb.Vertical(
         rrb.TextDocumentView(origin=entities.VERDICT, name="verdict"),
         rrb.TimeSeriesView(origin=_SIGMA, name="standard deviation of the position", axis_x=whole_log()),

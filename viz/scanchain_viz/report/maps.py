@@ -136,7 +136,7 @@ def _localized(localized: LocalizedLog) -> Iterator[page.Section]:
 
 
 def _path_section(localized: LocalizedLog) -> page.Section:
-    found, points = localized.localization, maps.map_points(localized.prior)
+    found, points = localized.localization, np.vstack(maps.map_points(localized.prior))
     final, live = (lie.lift_points(poses[:, :-1, -1]) for poses in (found.trajectory.poses, found.live))
     ends = final[found.is_placed]
     low, high = maps.surroundings(ends, [points])
