@@ -170,7 +170,9 @@ def test_scan_lines_are_found_by_the_order_of_points_or_by_their_elevations(in_o
     )
     cloud["x"], cloud["t"] = points[:, 0], np.arange(len(points))
     rows = found.organized(cloud, points).reshape(found.rows, found.columns)
-    for line in range(32):
-        here = np.flatnonzero(lines == line)
-        np.testing.assert_array_equal(rows[line]["t"][: len(here)], here)
-        assert not rows[line]["x"][len(here) :].any()
+    placed = rows[rows["x"] != 0.0]
+    of_line = np.repeat(np.arange(32), np.count_nonzero(rows["x"], axis=1))
+    assert len(placed) > 0.999 * len(points)
+    assert (lines[placed["t"]] == of_line).mean() > 0.998
+    assert (np.diff(placed["t"].astype(int))[np.diff(of_line) == 0] > 0).all()
+    assert all((np.diff((row != 0.0).astype(int)) <= 0).all() for row in rows["x"]), "a hole in a line"
