@@ -55,18 +55,11 @@ def entry_of(base: str) -> Entry | None:
     else:
         if name not in known:
             raise InputError(f"evalio has no pipeline {name!r}; choose among {', '.join(sorted(known))}")
-        defaults = _RANGES_M | known[name].default_params()
-        defaults |= _CHANGED.get(name, {})
+        defaults = _RANGES_M | known[name].default_params() | _CHANGED.get(name, {})
         fields = [(key, type(value), value) for key, value in defaults.items()]
         settings = msgspec.defstruct("Parameters", fields, frozen=True, forbid_unknown_fields=True)()
-    return Entry(
-        partial(EvalioPipeline, name),
-        "evalio",
-        settings,
-        None,
-        forgets=name != "genz",
-        wants_imu=name in _WANT_IMU,
-    )
+    forgets, wants_imu = name != "genz", name in _WANT_IMU
+    return Entry(partial(EvalioPipeline, name), "evalio", settings, None, forgets=forgets, wants_imu=wants_imu)
 
 
 def _imported(module: str) -> Any:
@@ -91,6 +84,7 @@ class EvalioPipeline:
             f"{kind.__name__} {kind.version()} of evalio, {self.ranges['min_range']:g} to "
             f"{self.ranges['max_range']:g} m, {''.join(changed)}else its defaults"
             f"{'; without times of points ' * bool(untimed)}{untimed}"
+            f"{'; its poses, two scans late, are extrapolated' * (name in _LATE)}"
         )
         self.lines: ScanLines | None = None
         self.at_stamp, self.held_ns, self.samples = AtStamp(), list[int](), list[tuple[int, Vector, Vector]]()
