@@ -74,7 +74,7 @@ $(BASELINES): pyproject.toml $(RUNTIME)
 	touch $@
 
 $(DEV): pyproject.toml $(RUNTIME)
-	$(INSTALL) --editable '.[baselines,cluster,remote,dev]'
+	$(INSTALL) --editable '.[baselines,evalio,cluster,remote,dev]'
 	touch $@
 
 $(DOCS): pyproject.toml $(RUNTIME)

@@ -117,7 +117,7 @@ class InPlane:
         return lie.flatten(self.baseline.track(raised, np.tile(times_s, levels), stamp_ns))
 
 
-_DISTORTED = 2  # first scans that it does not deskew, for lack of a previous motion
+DISTORTED = 2  # first scans that KISS-ICP does not deskew, for lack of a previous motion
 
 
 def _imported(module: str, package: str) -> Any:
@@ -168,7 +168,7 @@ class KissIcp:
         frame, times = finite(points, times_s)
         self.odometry.register_frame(frame, times)
         self.scans += 1
-        held_s = middle(times) if self.scans <= _DISTORTED or not len(times) else float(times.max())
+        held_s = middle(times) if self.scans <= DISTORTED or not len(times) else float(times.max())
         return self.at_stamp.move(np.array(self.odometry.last_pose, np.float64), stamp_ns, held_s)
 
 

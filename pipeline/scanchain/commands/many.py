@@ -210,6 +210,7 @@ def compare(
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
       rko-lio                  3D only, with the log's IMU
+      evalio:ct, evalio:kiss, …    3D only, the pipelines of evalio; evalio stands for all of them
       my_module:MyOdometry     your own class, with the methods of scanchain.baselines.Baseline
     A name that several begin with stands for all of them: kiss, open3d. Sections of --config hold for all of
     ours, as in scanchain run; a table of a method's name changes that method, one of another name is a variant:

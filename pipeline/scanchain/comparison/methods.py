@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import Struct
 
-from scanchain.baselines import BASELINES
+from scanchain.baselines import BASELINES, Entry
+from scanchain.comparison.evalio_pipelines import PIPELINES, entry_of
 from scanchain.config import MATCHERS, Config
 from scanchain.errors import InputError
 from scanchain.plugins import is_class_name
@@ -31,8 +32,8 @@ _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configurati
 class Method(Struct, frozen=True):
     """One row of a comparison.
 
-    base : one of OURS or BASELINES, or MODULE:CLASS with a Baseline's methods (in 2D of points (N, 2) and poses
-        (3, 3)), which is given the settings as keywords
+    base : one of OURS or BASELINES, ``evalio:NAME``, or MODULE:CLASS with a Baseline's methods (in 2D of points
+        (N, 2) and poses (3, 3)), which is given the settings as keywords
     settings : as TOML holds them; for ours the configuration by section, except those that all methods share
     """
 
@@ -157,10 +158,10 @@ def _method(
         raise InputError(f"{name!r} cannot be a folder's name; let the method's begin with a letter")
     if base in OURS:
         own = _our_settings(base, _overrides(own, where), dimension, shared, overrides)
-    elif base in BASELINES:
-        own = _their_settings(name, base, own, dimension, where)
+    elif (entry := entry_of(base)) is not None:
+        own = _their_settings(name, entry, own, dimension, where)
     elif not is_class_name(base):
-        known, word = (*OURS, *BASELINES), base.lower()
+        known, word = (*OURS, *BASELINES, *PIPELINES), base.lower()
         near = [each for each in known if word in each] or difflib.get_close_matches(word, known) or known
         raise InputError(
             f"there is no method {base!r}; choose among {', '.join(near)}, or say in --config what [{name}] is a "
@@ -174,13 +175,15 @@ def _spelled_out(name: str, dimension: int) -> Sequence[str]:
     word = name.lower().replace("_", "-")
     if is_class_name(name) or name in OURS:
         return [name]
+    if word == "evalio":
+        return PIPELINES
     return [
         each for each in default_names(dimension, has_imu=True) if word != each and each.startswith(f"{word}-")
     ] or [word if word in BASELINES else name]
 
 
-def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
-    defaults = BASELINES[base].settings if dimension == 3 else BASELINES[base].planar
+def _their_settings(name: str, entry: Entry, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
+    defaults = entry.settings if dimension == 3 else entry.planar
     if defaults is None:
         raise InputError(f"{name} is made for 3D clouds, the log is 2D; leave it out of --methods")
     try:

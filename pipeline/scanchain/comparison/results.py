@@ -17,7 +17,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from scanchain import evaluation, lie
-from scanchain.baselines import BASELINES
+from scanchain.comparison.evalio_pipelines import entry_of
 from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, Outcome, Status, StoredScans
 from scanchain.comparison.table import COLUMNS, Row, Table
@@ -367,7 +367,8 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
             why = f"the ground truth refutes {judgment.error}: ATE {ate_m:.4f} m"
             judgments[name] = replace(judgment, verdict=Verdict.CHECK, reason=why, error="")
     rows = [_row(results, method, more[method.name], judgments.get(method.name)) for method in results.methods]
-    packages = sorted({BASELINES[method.base].package for method in results.methods if method.base in BASELINES})
+    entries = [entry_of(method.base) for method in results.methods]
+    packages = sorted({entry.package for entry in entries if entry is not None})
     return Table(
         log=", ".join(str(path) for path in log.paths),
         topic=log.topic,

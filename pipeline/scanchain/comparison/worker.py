@@ -20,8 +20,9 @@ import numpy as np
 from numpy.lib.format import open_memmap
 
 from scanchain import plugins
-from scanchain.baselines import BASELINES, InPlane
+from scanchain.baselines import InPlane
 from scanchain.comparison import processes
+from scanchain.comparison.evalio_pipelines import entry_of
 from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import EndReport, Status, StoredScans
 from scanchain.data import Pose, Scan, Trajectory
@@ -47,8 +48,8 @@ class _Others:
     """A baseline or a class of the user as ``Ours``: scans in, poses out."""
 
     def __init__(self, method: Method, dimension: int) -> None:
-        if method.base in BASELINES:
-            entry = BASELINES[method.base]
+        entry = entry_of(method.base)
+        if entry is not None:
             self.baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
             if dimension == 2:
                 self.baseline = InPlane(self.baseline, is_raised=entry.is_raised)
@@ -97,7 +98,8 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
     """Import and compile with a throwaway instance; errors are ignored here, as they will occur again."""
-    if method.base in BASELINES and not BASELINES[method.base].forgets:
+    entry = entry_of(method.base)
+    if entry is not None and not entry.forgets:
         return
     runner = start(method, T_base_lidar)
     with suppress(Exception):

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import shutil
 from collections.abc import Callable
+from difflib import get_close_matches
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from tempfile import mkdtemp
 from time import sleep
@@ -145,8 +148,39 @@ def fetch_whole(file: RemoteFile) -> Path:
     return copy
 
 
+def evalio_name(path: Path) -> str:
+    """``NAME/SEQUENCE`` of the path ``evalio:NAME/SEQUENCE``, relative or not; empty for any other path."""
+    found = re.search(r"(?:^|/)evalio:(.*)", path.as_posix())
+    return found[1] if found else ""
+
+
+def evalio_sequence(path: Path) -> Any:
+    """The sequence of evalio that a path names. Raises InputError if it is unknown or not downloaded."""
+    name = evalio_name(path)
+    try:
+        datasets = import_module("evalio.datasets")
+    except ImportError:
+        raise MissingExtraError("evalio", "evalio") from None
+    folder = datasets.get_data_dir()
+    datasets.set_data_dir(folder)  # else evalio prints a note on its default folder
+    known = datasets.all_sequences()
+    if name not in known:
+        near = ", ".join(get_close_matches(name, known)) or ", ".join(sorted(datasets.all_datasets()))
+        raise InputError(
+            f"evalio:{name}: evalio has no such sequence; evalio ls datasets lists them, as of {near}"
+        )
+    if not known[name].is_downloaded():
+        raise InputError(
+            f"evalio:{name}: is not in {folder}; set EVALIO_DATA to where it is, or download it: evalio dl {name}"
+        )
+    return known[name]
+
+
 def files_of(path: Path) -> list[Path]:
     """The file itself, or all files in a folder and its subfolders, sorted by path."""
+    if evalio_name(path):
+        sequence = evalio_sequence(path)
+        return [file for part in sequence.files() for file in files_of(sequence.folder / part)]
     return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
 
 

@@ -17,6 +17,7 @@ from scanchain.logs.formats import (
     UnknownFormatError,
     carmen,
     clouds,
+    evalio,
     kitti,
     left_out,
     mcap,
@@ -29,6 +30,7 @@ from scanchain.logs.index import FileIndex
 from scanchain.logs.stream import are_parts, complete
 
 _FORMATS = mcap.FORMAT, ros1_bag.FORMAT, ros2_bag.FORMAT, carmen.FORMAT, kitti.RAW, kitti.ODOMETRY, clouds.FORMAT
+_FORMATS += (evalio.FORMAT,)
 FORMATS = {each.name: each for each in _FORMATS}  # in the order in which paths are tested
 _KNOWN = ", ".join(each.description for each in _FORMATS)
 _KNOWN += ", or name a class of your own that reads it, --log.format module:Class"
@@ -146,7 +148,7 @@ def _format_of(path: Path, head: bytes) -> Format:
     if (path / _RUN_FILE).is_file():
         raise InputError(f"{path}: is a run directory, not a log; give the log named in its {_RUN_FILE}")
     if not head and not path.is_dir():
-        return mcap.FORMAT
+        return evalio.FORMAT if evalio.FORMAT.recognizes(path, head) else mcap.FORMAT
     if found := _recognized(path, head):
         return found
     if path.is_dir():

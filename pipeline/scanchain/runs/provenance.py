@@ -125,7 +125,7 @@ def identity_of(source: Source) -> str:
     """Hash of path, sizes and modification times, or version of a remote file; empty where unreadable."""
     try:
         if isinstance(source, Path):
-            files = [(file, file.stat()) for file in files_of(source.resolve(strict=True))]
+            files = [(file, file.stat()) for file in files_of(source.resolve())]
             parts = [str(source.resolve()), *(f"{file} {each.st_size} {each.st_mtime_ns}" for file, each in files)]
         else:
             remote = RemoteFile(source)
