@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Count, NonNegative, Positive
 from scanchain.data import Inertial, Pose, RawPoints
-from scanchain.errors import InputError, MissingExtraError
+from scanchain.errors import MissingExtraError, NotApplicableError
 
 
 class Baseline(Protocol):
     """A third-party odometry method, run on the same scans as ours.
 
-    Any class with ``track`` can be compared; without a ``description`` it goes by its name. One with
-    ``add_inertial`` is given the ``Inertial`` of a scan before the scan, on logs that have an IMU.
+    One with ``add_inertial`` is given the ``Inertial`` of a scan before the scan, on logs that have an IMU.
     """
 
     @property
@@ -269,7 +268,7 @@ class RkoLio:
         Raises InputError at the second scan if there has been no sample of an IMU.
         """
         if self.scans and not self.has_imu:
-            raise InputError("needs an IMU, of which the log has no sample; leave it out of --methods")
+            raise NotApplicableError("needs an IMU, of which the log has no sample")
         self.scans += 1
         frame, times = finite(points, times_s)
         since_ns = np.rint(1e9 * times).astype(np.int64) if len(times) else np.zeros(len(frame), np.int64)

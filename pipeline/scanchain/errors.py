@@ -45,6 +45,10 @@ class MissingExtraError(InputError):
         super().__init__(f"{package} is not installed; install it with: pip install 'scanchain[{extra}]'")
 
 
+class NotApplicableError(InputError):
+    """A method needs what a log does not have."""
+
+
 def _keyword(found: re.Match[str]) -> str:
     option: str = found[1] or ""
     return _KEYWORDS.get(option, option.replace(".", "__") if "." in option else found[0])

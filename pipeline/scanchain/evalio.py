@@ -56,8 +56,8 @@ class ScanchainPipeline(Pipeline):
 
     @staticmethod
     def url() -> str:
-        """Where it is explained."""
-        return "https://github.com/scanchain/scanchain"
+        """Where it comes from: nowhere public yet."""
+        return ""
 
     @staticmethod
     def default_params() -> dict[str, Any]:

@@ -20,7 +20,7 @@ class Bad:
         self.nature, self.file = nature, Path(file)
         self.scans, self.hoard = 0, []
 
-    def track(self, points, times_s, stamp_ns):
+    def register(self, points, stamp_s, times_s):
         self.scans += 1
         pose = np.eye(points.shape[1] + 1)
         if self.scans <= 10 and self.nature not in AT_ONCE:
@@ -60,7 +60,7 @@ class Shifted:
         self.scans, self.step_m = 0, step_m
         self.description = f"moves {step_m} m a scan"
 
-    def track(self, points, times_s, stamp_ns):
+    def register(self, points, stamp_s, times_s):
         pose = np.eye(points.shape[1] + 1)
         pose[0, -1] = self.step_m * self.scans
         self.scans += 1
@@ -80,5 +80,5 @@ class Turned:
             self.T_odom_lidar = self.T_odom_lidar @ lie.exp(np.concatenate([np.zeros(3), lasted_s * rate]))
             self.last_ns = stamp_ns
 
-    def track(self, points, times_s, stamp_ns):
+    def register(self, points, stamp_s, times_s):
         return self.T_odom_lidar

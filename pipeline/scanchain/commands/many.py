@@ -211,7 +211,7 @@ def compare(
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
       rko-lio                  3D only, with the log's IMU
       evalio:ct, evalio:kiss, …    3D only, the pipelines of evalio; evalio stands for all of them
-      my_module:MyOdometry     your own class, with the methods of scanchain.baselines.Baseline
+      my_module:MyOdometry     your own class: register(points, stamp_s, times_s) returns the pose
     A name that several begin with stands for all of them: kiss, open3d. Sections of --config hold for all of
     ours, as in scanchain run; a table of a method's name changes that method, one of another name is a variant:
 
@@ -223,6 +223,10 @@ def compare(
       local_map.voxel_size_m = 0.5
       [mine]
       method = "my_package.odometry:MyOdometry"
+      [theirs]
+      command = "their_slam {scans} --out {poses}"
+
+    A command reads a folder of PLY files, named by their stamps in nanoseconds, and writes a TUM file of poses.
 
     \b
     Examples:

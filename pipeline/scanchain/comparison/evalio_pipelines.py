@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.baselines import BASELINES, DISTORTED, AtStamp, Entry, finite
 from scanchain.data import Inertial, Matrix, Pose, RawPoints, Vector
-from scanchain.errors import InputError, MissingExtraError
+from scanchain.errors import InputError, MissingExtraError, NotApplicableError
 
 _PREFIX = "evalio:"
 PIPELINES = tuple(_PREFIX + name for name in ("ct", "dlio", "form", "genz", "kiss", "liosam", "loam", "mad"))
@@ -99,7 +99,7 @@ class EvalioPipeline:
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """Register one scan; the pose is moved to the scan's stamp.
 
-        Raises InputError at the first scan if the log lacks what the pipeline needs.
+        Raises NotApplicableError at the first scan if the log lacks what the pipeline needs.
         """
         frame, times = finite(points, times_s)
         first_s, last_s = (float(times.min()), float(times.max())) if len(times) else (0.0, 0.0)
@@ -121,7 +121,7 @@ class EvalioPipeline:
 
     def _start(self, points: Matrix, sweep_s: float) -> None:
         if self.name in _WANT_IMU and not self.samples:
-            raise InputError("needs an IMU, of which the first scan has no sample; leave it out of --methods")
+            raise NotApplicableError("needs an IMU, of which the first scan has no sample")
         if not sweep_s:
             self.params |= _UNTIMED.get(self.name, {})
         rows, columns = 1, len(points)
@@ -161,7 +161,7 @@ class EvalioPipeline:
 class ScanLines:
     """Scan lines of a lidar, found in the first scan by the order of its points, or else by their elevations.
 
-    Raises InputError where neither shows them.
+    Raises NotApplicableError where neither shows them.
     """
 
     def __init__(self, points: Matrix) -> None:
@@ -174,9 +174,8 @@ class ScanLines:
             self.edges = 0.5 * (ordered[gaps] + ordered[gaps + 1])
             lines = self._of(points)
             if not len(gaps) or not _are_lines(lines, points, elevations):
-                raise InputError(
-                    "needs the lidar's scan lines, which neither the order of the points nor their elevations "
-                    "show; leave it out of --methods"
+                raise NotApplicableError(
+                    "needs the lidar's scan lines, which neither the order of the points nor their elevations show"
                 )
         counts = np.bincount(lines)
         self.rows, self.columns = len(counts), round(_SPARE * counts.max())

@@ -23,6 +23,8 @@ _ANY = "matcher"  # ours with the matcher that the settings name
 _VARIANTS = ("", "+loops", "+imu")  # of ours
 OURS = tuple(f"{name}{variant}" for name in (*MATCHERS, _ANY) for variant in _VARIANTS)
 _ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti")
+COMMAND = "command"  # base of a method that is a command, and the key of its table
+SCANS, POSES = "{scans}", "{poses}"  # in a command: the folder of PLY files, and the TUM file that it writes
 _BASE = "method"  # the key of a table that names the method it is a variant of
 _KINDS = ("matching.matcher", "loops.enabled", "odometry.imu")  # keys that distinguish our methods
 _SECTIONS = Config.__struct_fields__
@@ -32,8 +34,9 @@ _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configurati
 class Method(Struct, frozen=True):
     """One row of a comparison.
 
-    base : one of OURS or BASELINES, ``evalio:NAME``, or MODULE:CLASS with a Baseline's methods (in 2D of points
-        (N, 2) and poses (3, 3)), which is given the settings as keywords
+    base : one of OURS or BASELINES, ``evalio:NAME``, MODULE:CLASS with a method ``register(points, stamp_s,
+        times_s)`` that returns the pose (in 2D of points (N, 2) and poses (3, 3)), which is given the settings as
+        keywords, or COMMAND
     settings : as TOML holds them; for ours the configuration by section, except those that all methods share
     """
 
@@ -72,14 +75,10 @@ class Variation(NamedTuple):
             return method if keys else None
         if self.key not in method.settings:
             return None
-        value = tomllib.loads(f"value = {self.value}")["value"]
-        own = method.settings | {self.key: value}
-        return msgspec.structs.replace(
-            method,
-            settings=_their_settings(method.name, method.base, own, dimension, f"--vary {self.key}")
-            if method.base in BASELINES
-            else own,
-        )
+        own = method.settings | {self.key: tomllib.loads(f"value = {self.value}")["value"]}
+        if (entry := entry_of(method.base)) is not None:
+            own = _their_settings(method.name, entry, own, dimension, f"--vary {self.key}")
+        return msgspec.structs.replace(method, settings=own)
 
 
 def default_names(dimension: int, *, has_imu: bool = False) -> tuple[str, ...]:
@@ -156,6 +155,13 @@ def _method(
     base, own = str(table.get(_BASE, name)), {key: value for key, value in table.items() if key != _BASE}
     if name.startswith("."):
         raise InputError(f"{name!r} cannot be a folder's name; let the method's begin with a letter")
+    if COMMAND in own and _BASE not in table:
+        if not (isinstance(own[COMMAND], str) and SCANS in own[COMMAND] and POSES in own[COMMAND]):
+            raise InputError(
+                f"{where} {COMMAND} is {own[COMMAND]!r}; wanted one in which {SCANS} stands for a folder of PLY "
+                f"files, and {POSES} for the TUM file that it writes"
+            )
+        return Method(name, COMMAND, own)
     if base in OURS:
         own = _our_settings(base, _overrides(own, where), dimension, shared, overrides)
     elif (entry := entry_of(base)) is not None:

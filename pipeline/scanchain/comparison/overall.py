@@ -179,7 +179,7 @@ def overall_of(logs: Sequence[ComparedLog]) -> Overall:
 
 def _error_m(row: Row | None) -> float:
     """ATE, infinite for a failure, NaN where it did not take part or there is no truth."""
-    if row is None or row.status is Status.MISSING:
+    if row is None or not row.status.took_part:
         return math.nan
     ate_m = row.figures.get("ate_m")
     return math.inf if row.status.is_failure else math.nan if ate_m is None else ate_m

@@ -111,6 +111,7 @@ class Status(StrEnum):
 
     OK = "ok"
     MISSING = "not installed"
+    NOT_APPLICABLE = "not applicable"
     CRASHED = "crashed"
     TIMED_OUT = "timed out"
     OUT_OF_MEMORY = "out of memory"
@@ -118,7 +119,12 @@ class Status(StrEnum):
     @property
     def is_failure(self) -> bool:
         """True if it started and failed."""
-        return self not in (Status.OK, Status.MISSING)
+        return self.took_part and self is not Status.OK
+
+    @property
+    def took_part(self) -> bool:
+        """True if it is installed, and the log has what it needs."""
+        return self not in (Status.MISSING, Status.NOT_APPLICABLE)
 
 
 class EndReport(Struct, frozen=True):
@@ -165,12 +171,12 @@ class Outcome:
 def run_all(
     methods: Sequence[Method], scans: StoredScans, folder: Path, *, repeat: int, limits: Limits, progress: Progress
 ) -> dict[str, list[Outcome]]:
-    """``repeat`` runs of every method, each round starting with another one; one not installed is tried once."""
+    """``repeat`` runs of every method that takes part, each round starting with another one."""
     outcomes: dict[str, list[Outcome]] = {method.name: [] for method in methods}
     for turn in range(repeat):
         for place in range(len(methods)):
             method = methods[(place + turn) % len(methods)]
-            if any(outcome.report.status is Status.MISSING for outcome in outcomes[method.name]):
+            if not all(outcome.report.status.took_part for outcome in outcomes[method.name]):
                 continue
             outcome = _run(method, scans, folder / f"run_{turn}_{place}", limits)
             outcomes[method.name].append(outcome)

@@ -23,10 +23,11 @@ from scanchain import plugins
 from scanchain.baselines import InPlane
 from scanchain.comparison import processes
 from scanchain.comparison.evalio_pipelines import entry_of
-from scanchain.comparison.methods import Method
+from scanchain.comparison.methods import COMMAND, Method
 from scanchain.comparison.processes import EndReport, Status, StoredScans
+from scanchain.comparison.program import run_program
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import MissingExtraError, ScanchainError, one_line, shown
+from scanchain.errors import MissingExtraError, NotApplicableError, ScanchainError, one_line, shown
 from scanchain.processes import MOST_CHARACTERS, die_first, die_with_parent, peak_mib
 
 if TYPE_CHECKING:
@@ -48,20 +49,23 @@ class _Others:
     """A baseline or a class of the user as ``Ours``: scans in, poses out."""
 
     def __init__(self, method: Method, dimension: int) -> None:
-        entry = entry_of(method.base)
+        entry, self.register = entry_of(method.base), None
         if entry is not None:
-            self.baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
+            self.odometry = entry.make(msgspec.convert(method.settings, type(entry.settings)))
             if dimension == 2:
-                self.baseline = InPlane(self.baseline, is_raised=entry.is_raised)
+                self.odometry = InPlane(self.odometry, is_raised=entry.is_raised)
         else:
-            self.baseline = plugins.load(method.base, "track")(**method.settings)
-        self.description = str(getattr(self.baseline, "description", "")) or method.base
-        self.add_inertial = getattr(self.baseline, "add_inertial", None)
+            self.odometry = plugins.load(method.base, "register")(**method.settings)
+            self.register = self.odometry.register
+        self.description = str(getattr(self.odometry, "description", "")) or method.base
+        self.add_inertial = getattr(self.odometry, "add_inertial", None)
 
     def track(self, scan: Scan) -> Pose:
         if scan.inertial is not None and self.add_inertial is not None:
             self.add_inertial(scan.inertial)
-        return self.baseline.track(scan.points, scan.times_s, scan.stamp_ns)
+        if self.register is not None:
+            return self.register(scan.points, 1e-9 * scan.stamp_ns, scan.times_s)
+        return self.odometry.track(scan.points, scan.times_s, scan.stamp_ns)
 
     def measure_errors(self, scans: StoredScans, folder: Path) -> None:
         """Nothing: its error is bounded by the other trajectories."""
@@ -72,6 +76,8 @@ class _Others:
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     """Track every scan, then finish."""
+    if method.base == COMMAND:
+        return _run_command(scans, method, folder)
     began = perf_counter()
     warm_up(scans.scans(), method, scans.T_base_lidar)
     runner = start(method, scans.T_base_lidar, is_mounted=scans.is_mounted)
@@ -84,7 +90,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
         pose = runner.track(scan)
         took_s, cpu_took_s = perf_counter() - began_s, process_time() - cpu_began_s
         if np.shape(pose) != wanted:
-            raise ValueError(f"track returned {shown(pose)}; wanted a pose {wanted}")
+            raise ValueError(f"it returned {shown(pose)}; wanted a pose {wanted}")
         if not np.isfinite(pose).all():
             raise ValueError("a pose that is not finite")
         track[scan.index] = pose, took_s, cpu_took_s
@@ -94,6 +100,16 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     report = EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
     runner.measure_errors(scans, folder)
     return report
+
+
+def _run_command(scans: StoredScans, method: Method, folder: Path) -> EndReport:
+    """All scans at once: each is taken to need the same time."""
+    command = str(method.settings[COMMAND])
+    poses, seconds, cpu_seconds, peak = run_program(command, scans, folder)
+    track = open_memmap(folder / processes.TRACK_FILE, "w+", scans.track_type, (len(scans),))
+    track["pose"], track["seconds"], track["cpu_seconds"] = poses, seconds, cpu_seconds
+    np.save(folder / processes.TRAJECTORY_FILE, poses)
+    return EndReport(Status.OK, "", f"{command}; times are means, reading and writing included", peak_mib=peak)
 
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
@@ -119,7 +135,8 @@ def run(folder: Path) -> None:
     """Run the task of a folder and write the report."""
     task = (folder / processes.TASK_FILE).read_bytes()
     method, scans = processes.decode(task, tuple[Method, StoredScans])
-    report = msgspec.structs.replace(_report(scans, method, folder), peak_mib=peak_mib())
+    report = _report(scans, method, folder)
+    report = msgspec.structs.replace(report, peak_mib=report.peak_mib or peak_mib())
     (folder / processes.REPORT_FILE).write_bytes(msgspec.json.encode(report))
 
 
@@ -128,6 +145,8 @@ def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
         return work(scans, method, folder)
     except MissingExtraError as error:
         return EndReport(Status.MISSING, str(error))
+    except NotApplicableError as error:
+        return EndReport(Status.NOT_APPLICABLE, str(error))
     except MemoryError as error:
         return EndReport(Status.OUT_OF_MEMORY, _words(error))
     except ScanchainError as error:

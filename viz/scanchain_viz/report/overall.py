@@ -119,7 +119,7 @@ def _logs(overall: Overall) -> Grid:
 def _facts(log: ComparedLog) -> list[Cell | str]:
     if (table := log.table) is None:
         return [Cell(log.reason, "wide")]
-    tried = [row.status is Status.OK for row in table.rows if row.status is not Status.MISSING]
+    tried = [row.status is Status.OK for row in table.rows if row.status.took_part]
     finished = page.bad_if(not all(tried), f"{sum(tried)}/{len(tried)}")
     return [f"{table.scans:,}", f"{table.points_per_scan:,.0f}", finished, table.truth or "none"]
 
