@@ -7,6 +7,7 @@ from urllib.parse import unquote
 
 import pytest
 
+import scanchain
 from scanchain.__main__ import main
 from scanchain.batch.comparisons import compare_each, logs_of, publish
 from scanchain.comparison.methods import Variation, resolve
@@ -14,6 +15,7 @@ from scanchain.comparison.overall import OVERALL_FILE
 from scanchain.comparison.table import TABLE_FILE, read_table
 from scanchain.errors import InputError
 from scanchain.runs.job import Progress
+from scanchain.settings import Override
 from tests.support import made
 from tests.support.browser import look
 from tests.support.in_process import here
@@ -150,6 +152,15 @@ def test_parts_of_one_drive_are_one_log_and_other_files_are_one_each(logs, tmp_p
     assert logs_of([logs[0], town], "auto") == [(logs[0],), (town,)]
     assert logs_of([logs[0].parent], "auto") == [(logs[0],), (logs[1],)]
     assert logs_of([logs[0], wheels], "auto") == [(logs[0],), (wheels,)]  # which is missing, as its row says
+
+
+def test_a_topic_holds_for_the_logs_that_have_it(logs, settings, tmp_path):
+    town = made.log("town", folder=tmp_path / "town", seconds=1, sensor="vlp-16")
+    topic = scanchain.open_log(town).topic
+    given = {"overrides": (Override("log.topic", topic, "--topic"),), "progress": Announced()}
+    overall = compare([logs[0], town], tmp_path / "out", settings, **given)
+    assert [log.table.topic for log in overall.logs] == ["/scan", topic]
+    assert f"{logs[0]}: has no topic {topic}; its own lidar is used" in given["progress"].lines
 
 
 def test_a_directory_or_a_site_that_holds_something_else_is_left_alone(logs, settings, tmp_path):

@@ -197,9 +197,10 @@ def compare(
 
     Several LOGs that are the parts of one drive are one log. Otherwise methods are compared on each, also of a
     folder or a quoted pattern, and DIR gets a folder per log and the statistics over all: medians with confidence
-    intervals, wins, ranks. Called again, only the logs that have no result yet are compared. In --gt and
-    --relations {} stands for the name of the log. --ray, --site and --vary hold for one log, too. KEY of --vary is
-    one of the configuration or of a method, or the last part of it; it is set for all methods that have it.
+    intervals, wins, ranks. Called again, only the logs that have no result yet are compared. --topic holds for the
+    logs that have it; in --gt and --relations {} stands for the name of the log. --ray, --site and --vary hold for
+    one log, too. KEY of --vary is one of the configuration or of a method, or the last part of it; it is set for all
+    methods that have it.
 
     \b
     Methods:
