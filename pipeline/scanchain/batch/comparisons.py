@@ -95,8 +95,8 @@ def compare_each(
 ) -> Overall:
     """Compare methods on each log that has no result in ``out`` yet, and write the statistics over all.
 
-    present, given : as of ``compare``; a lidar topic holds for the logs that have it, and in the file of true poses
-        or relations {} stands for the name of the log
+    present, given : as of ``compare``; a lidar topic holds for the logs that have it, in the file of true poses or
+        relations {} stands for the name of the log
     work : where it is done; None for this process, one log after the other, so that times are comparable
     force : whether results of earlier calls are replaced
     On Ctrl-C the log in progress is discarded, and those not begun are listed as such. A log that cannot be read

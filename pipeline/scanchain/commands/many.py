@@ -199,8 +199,8 @@ def compare(
     folder or a quoted pattern, and DIR gets a folder per log and the statistics over all: medians with confidence
     intervals, wins, ranks. Called again, only the logs that have no result yet are compared. --topic holds for the
     logs that have it; in --gt and --relations {} stands for the name of the log. --ray, --site and --vary hold for
-    one log, too. KEY of --vary is one of the configuration or of a method, or the last part of it; it is set for all
-    methods that have it.
+    one log, too. KEY of --vary is one of the configuration or of a method, or the last part of it; methods that
+    have it take part.
 
     \b
     Methods:

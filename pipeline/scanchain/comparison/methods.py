@@ -77,7 +77,7 @@ class Variation(NamedTuple):
             return None
         own = method.settings | {self.key: tomllib.loads(f"value = {self.value}")["value"]}
         if (entry := entry_of(method.base)) is not None:
-            own = _their_settings(method.name, entry, own, dimension, f"--vary {self.key}")
+            own = _their_settings(entry, own, dimension, f"--vary {self.key}")
         return msgspec.structs.replace(method, settings=own)
 
 
@@ -165,7 +165,7 @@ def _method(
     if base in OURS:
         own = _our_settings(base, _overrides(own, where), dimension, shared, overrides)
     elif (entry := entry_of(base)) is not None:
-        own = _their_settings(name, entry, own, dimension, where)
+        own = _their_settings(entry, own, dimension, where)
     elif not is_class_name(base):
         known, word = (*OURS, *BASELINES, *PIPELINES), base.lower()
         near = [each for each in known if word in each] or difflib.get_close_matches(word, known) or known
@@ -188,10 +188,8 @@ def _spelled_out(name: str, dimension: int) -> Sequence[str]:
     ] or [word if word in BASELINES else name]
 
 
-def _their_settings(name: str, entry: Entry, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
-    defaults = entry.settings if dimension == 3 else entry.planar
-    if defaults is None:
-        raise InputError(f"{name} is made for 3D clouds, the log is 2D; leave it out of --methods")
+def _their_settings(entry: Entry, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
+    defaults = entry.planar if dimension == 2 and entry.planar is not None else entry.settings
     try:
         return msgspec.to_builtins(msgspec.convert(msgspec.to_builtins(defaults) | own, type(defaults)))
     except msgspec.ValidationError as error:
