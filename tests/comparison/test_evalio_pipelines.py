@@ -12,7 +12,7 @@ from scanchain.comparison import worker
 from scanchain.comparison.evalio_pipelines import PIPELINES, ScanLines, entry_of
 from scanchain.comparison.methods import resolve
 from scanchain.data import Inertial, Trajectory
-from scanchain.errors import InputError, NotApplicableError
+from scanchain.errors import InputError, MissingExtraError, NotApplicableError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.simulation import plan
 from scanchain.simulation.imu import IMUS
