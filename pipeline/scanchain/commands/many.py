@@ -209,7 +209,7 @@ def compare(
       plicp+imu, svd+imu       ours, with the log's IMU
       CLASS, CLASS+loops, CLASS+imu    ours with the matcher of --matcher MODULE:CLASS
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
-      open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
+      open3d-p2l, open3d-multiscale, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
       rko-lio                  3D only, with the log's IMU
       evalio:ct, evalio:kiss, …    3D only, the pipelines of evalio; evalio stands for all of them
       my_module:MyOdometry     your own class: register(points, stamp_s, times_s) returns the pose
