@@ -18,11 +18,10 @@ _MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: 
 _WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # a patch is planar up to this many noise variances; share below that
 _PLANAR = 0.5  # least share of planar patches at a range for its noise to be known
 _FEWEST = 60  # least number of patches at a range
-_CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is clutter
+_CLUTTER = (0.05, 0.1)  # share of the range and meters, above both of which a mode is clutter
 _LEAST_M = 1e-4  # smallest standard deviation reported: ranges may be rounded to one number
 _VARIES = 2.0  # ratio of the standard deviations at two ranges above which the noise is reported by range
 _KNOWN = 0.3  # least share of the patches at ranges whose noise is known
-_NEAREST_M = 0.05
 _SECTORS, _SECTOR_POINTS = 16, 8000  # a large first cloud: only parts of 16 sectors are searched for neighbors
 _WEDGE_POINTS, _WEDGE_PATCHES = 2000, 75  # later clouds: one wedge each, about another azimuth
 _GOLDEN = 0.618034  # share of the cloud's points between the middles of successive wedges
@@ -120,7 +119,7 @@ def _patches(points: RawPoints, most: int) -> tuple[NDArray[np.float64], NDArray
         points, azimuth = points[chosen], azimuth[chosen]
     rays = points.astype(np.float64)
     ranges_m = np.linalg.norm(rays, axis=1)
-    is_used = ranges_m > _NEAREST_M
+    is_used = ranges_m > 0.05
     rays, ranges_m, azimuth = rays[is_used], ranges_m[is_used], azimuth[is_used]
     count = len(rays)
     if count < size:
@@ -155,5 +154,5 @@ def _sigma_m(variances: NDArray[np.float64], range_m: float) -> float:
             break
     planar = np.searchsorted(variances, _WITHIN * variance, side="right") / len(variances) / _SHARE_WITHIN
     sigma_m = math.sqrt(variance)
-    is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
+    is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER[0] * range_m, _CLUTTER[1])
     return 0.0 if is_clutter else max(sigma_m, _LEAST_M)

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanchain.config import LogConfig, PreprocessConfig
-from scanchain.data import MOST_COPIES, RawPoints, Scan
+from scanchain.data import FEWEST_COPIED, MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError, counted, duration
 from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.publishers import Publisher
 
 _MOST_REPEATED = 0.5  # share of repeated stamps above which they are a warning, not a note
-_FEWEST_COPIED = 10  # smallest number of points of a copy; fewer can be equal by chance
 _COPIES_SHARE = 0.01  # share of copies among the scans above which they are a warning, not a note
 _MOST_RATE = 50.0  # ratio of two clock rates above which their units differ: by 1000, less gaps
 _AGAIN = 0.1  # distance from the first stamp, as a share of the jump, below which the recording restarted
@@ -120,7 +119,7 @@ class ScanCounts:
 
     def repeats(self, points: RawPoints) -> bool:
         """True if the points of a scan are bitwise identical to those of the previous one."""
-        if self._last is None or len(points) < _FEWEST_COPIED:
+        if self._last is None or len(points) < FEWEST_COPIED:
             return False
         last = self._last.points
         return np.array_equal(points[:_SAMPLE], last[:_SAMPLE]) and np.array_equal(points, last)

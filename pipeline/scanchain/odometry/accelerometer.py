@@ -11,11 +11,12 @@ from scanchain.data import GRAVITY_M_S2, LEAST_FIT, Match, Matrix, Pose, RestFor
 from scanchain.odometry.gyro import Gyro
 
 _FEWEST, _RECENT = 15, 20  # motions whose errors decide whether the accelerometer is used
-_BETTER, _WORSE = 0.9, 1.5  # ratio of squared errors below which it is used, and above which no longer
+_RATIO = (0.9, 1.5)  # of its squared errors to those of the last motion, below which it comes, and stays, in use
 _DETERMINED = 0.5  # least information of a match about the position, as a share of the largest of one direction
 _UNKNOWN_M_S = 1.0  # σ of the velocity above which it is not used
 _POSITION_M = 0.003  # least σ of a match
-_VELOCITY_M_S, _GRAVITY_M_S2, _BIAS_M_S2 = 40.0, 1.0, 0.05  # σ at first: any car, tilted axes, MEMS
+FASTEST_M_S = 40.0  # of any car whose speed is unknown
+_GRAVITY_M_S2, _BIAS_M_S2 = 1.0, 0.05  # σ at first: tilted axes, MEMS
 _TURNED = 2.0  # σ of the turn of gravity in the drifting odometry frame, in differences of gyro and match
 _WALK = 0.001  # random walk of the bias: m/s² per √s
 _NOISE_RAD = 0.001  # σ of the rotation of a match, by which gravity appears as an acceleration
@@ -190,7 +191,7 @@ class Accelerometer:
         self.x = np.zeros(12)
         self.x[_P] = T_odom_last[:3, 3] + R_odom @ self.p_lidar_imu
         self.x[_G] = -self.unit_m_s2 * R_odom @ mean
-        self.P = np.diag(np.repeat([_POSITION_M, _VELOCITY_M_S, _GRAVITY_M_S2, _BIAS_M_S2], 3) ** 2)
+        self.P = np.diag(np.repeat([_POSITION_M, FASTEST_M_S, _GRAVITY_M_S2, _BIAS_M_S2], 3) ** 2)
         self.of_prediction = self.of_match = 1.0
         return True
 
@@ -211,7 +212,7 @@ class Accelerometer:
         self.compared += 1
         if len(self.errors) >= _FEWEST:
             of_ours, of_others = map(sum, zip(*self.errors, strict=True))
-            self.is_trusted = of_ours < (_WORSE if self.is_trusted else _BETTER) * of_others
+            self.is_trusted = of_ours < _RATIO[self.is_trusted] * of_others
 
     def _adapt(self, square: float, *, persists: bool) -> None:
         """Adapt the factors on variances to a squared innovation, in σ², which has the last one's sign or not."""

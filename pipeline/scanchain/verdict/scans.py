@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from scanchain import lie
-from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
+from scanchain.data import LEAST_FIT, MOST_COPIES, SIMILAR_INTERVALS, Matrix
 from scanchain.verdict.evidence import Check, Evidence, Floats, Kind, Segment, listed, merged
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
@@ -28,7 +28,6 @@ _LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
 
 _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands reach
 _MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of the motion between two scans by scan matching
-_SIMILAR = 1.4  # largest ratio of the usual interval to one that is used; shorter ones are due to jittering stamps
 _LARGE_M = 1.0  # jump above which the trajectory is wrong
 
 _RESTING_M = 0.05  # largest distance from copies to the next scan at which the lidar was at rest
@@ -191,7 +190,7 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
     clocks.append(np.full(n - 1, usual_s))
     best = np.full(n - 2, np.inf)
     for interval_s in clocks:
-        plausible_s = np.maximum(interval_s, usual_s / _SIMILAR)
+        plausible_s = np.maximum(interval_s, usual_s / SIMILAR_INTERVALS)
         before, after = plausible_s[:-1], plausible_s[1:]
         change = motions[1:] - (after / before)[:, None] * motions[:-1]
         span_s2 = 0.5 * after * (before + after)
