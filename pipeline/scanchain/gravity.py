@@ -7,17 +7,16 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import gammaincinv
 
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import GRAVITY_M_S2, Integers, Matrix, RestForce, Vector
 from scanchain.graph.consistency import is_bent
 from scanchain.graph.factors import Prior
+from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
 
 _CORRELATED_S, _LEAST_S = 1.0, 0.01  # time constant of the errors, and least time between keyframes
-_SURE = 0.999  # probability that errors as stated pass the test
 _HELD_M, _HELD_RAD = 1e-4, 1e-5  # σ of position and heading of the first pose, which gravity and ground leave free
 
 
@@ -59,7 +58,7 @@ def leveled(graph: PoseGraph, forces: Mapping[int, RestForce], config: GraphConf
     result.move(0, T_level)
     note = f"IMU: its accelerometer levels the result to {math.degrees(known_rad):.1g}°"
     tilts_rad = np.linalg.norm(np.einsum("nij,nj->ni", result.poses[chosen, :2, :3], ups), axis=1)
-    if np.sum((tilts_rad / sigma_rad) ** 2) < 2.0 * gammaincinv(len(chosen), _SURE):
+    if np.sum((tilts_rad / sigma_rad) ** 2) < rejection_limit(0.0, 2 * len(chosen)):
         return result, note
     corrected = result.copy()
     _constrain(corrected, chosen, ups, sigma_rad)

@@ -15,7 +15,6 @@ from scanchain.config import LOSSES
 from scanchain.data import Integers, Mask, Vector
 from scanchain.errors import InputError, one_line
 
-_TRUE_SHARE = 0.999  # share of true loops whose χ² stays below the limit, if the noise model is right
 _SHARP = 1e4  # control above which truncated least squares is replaced by its limit
 _FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is almost convex; its factor there
 _ONE, _SLOPE = 0.99, 1e-3  # least weight at χ² = 0, and largest error of the slope, of a user-defined class
@@ -178,7 +177,7 @@ class RobustLoss:
 
 def rejection_limit(scale: float, degrees: int) -> float:
     """χ² above which an edge is an outlier: the kernel's scale², at least the 99.9 % quantile of inliers."""
-    return max(scale**2, 2.0 * float(gammaincinv(0.5 * degrees, _TRUE_SHARE)))
+    return max(scale**2, 2.0 * float(gammaincinv(0.5 * degrees, 0.999)))
 
 
 def limit_shares(scale: float, residuals: Integers, freedom: int) -> Vector:

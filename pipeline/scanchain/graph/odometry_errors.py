@@ -8,8 +8,8 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Integers, Mask, Matrix, Vector
+from scanchain.graph.consistency import FEWEST
 
-FEWEST = 3  # least number of rejected loop edges, none near another, that a drift or a jump must explain
 _SCALE_SIGMA, _TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations of the scale and of the turn per meter
 _SLIP_SIGMA_M, _JUMP_SIGMAS = 1.0, (1.0, 0.2)  # standard deviations, m or (m, rad)
 _SLIP_PROBABILITY, _JUMP_PROBABILITY = 1e-3, 1e-4  # that one begins at an edge

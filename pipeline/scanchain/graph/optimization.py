@@ -20,9 +20,9 @@ from scanchain.graph.problem import GraphProblem
 
 Rejection = Literal["update", "judge"]
 
+LARGE = 2000  # number of poses from which a graph is not judged as a whole again and again
 _WASTE = 0.1  # share of edges of zero weight above which a new symbolic analysis pays off
 _CRISP = 1e-6  # distance of a weight from 0 or 1 up to which it counts as 0 or 1
-_MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success
 _FEWER, _FEWEST = 0.3, 1e-3  # factor on the share of changes tried after a round without success; least share
 # a few steps per inlier set, until the poses have roughly settled; the next update continues
@@ -237,7 +237,7 @@ def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: Vector, price
     """
     kept, share = minimum.weights[minimizer.robust] > 0.5, 1.0
     prices = price * minimizer.shares[minimizer.robust]
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(50):
         gain = np.where(kept, against - prices, prices - against)
         if share < _FEWEST or not (gain > 0.0).any():
             break

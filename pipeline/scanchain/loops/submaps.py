@@ -22,7 +22,6 @@ RADII_AHEAD = 1.0  # radii of the trajectory after the anchor that a submap take
 RADII_BEHIND = 2.0  # radii of the trajectory before it: a lidar that looks ahead sees a location from far off
 _MAX_POINTS = 80_000  # largest number of points of a submap, from keyframes evenly spread over it
 _OF_MAP = 2  # factor on the number of keyframes in a submap of a map, which was seen from several sides
-_MAX_CACHED = 64  # largest number of voxel submaps in memory; the least recently used one is dropped first
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
 _MIN_GROUND_VOXELS = 10  # least number of voxels with such a normal; with fewer the lidar is assumed upright
 
@@ -106,8 +105,8 @@ class VoxelSubmaps:
             submap = self._build(keyframes[anchor], [keyframes[index] for index in chosen], is_of_map)
             submap.compact()
         self.cached[anchor, last] = submap
-        if len(self.cached) > _MAX_CACHED:
-            self.cached.popitem(last=False)
+        if len(self.cached) > 64:
+            self.cached.popitem(last=False)  # the least recently used one
         return submap
 
     def _nearest(self, anchor: Keyframe) -> list[int]:

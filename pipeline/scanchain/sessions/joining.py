@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Pose
+from scanchain.data import DOWNWEIGHTED, Closure, Keyframe, Matrix, Pose
 from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
@@ -29,11 +29,10 @@ _APART_M = 200.0  # path assumed between the last keyframe of a map and the firs
 _CLEAR = 0.1  # share of a map's keyframes with a closure in force above which it joins before others are tried
 _NEW_M = 5.0  # distance from older keyframes, at full scale, beyond which a keyframe is in a new area
 _NEW_KEYFRAMES = 3  # least number of them for which maps that were not found are searched for again
-_IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
 _MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # least share of contradictions reported, and ratio to that within maps
 _WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
 _PATH_M, _STEP_M = 8.0, 2.0  # length of paths in 2D that are searched for as a whole, and spacing
-_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
+_AGREE = (0.5, 0.1)  # m and rad, largest difference between poses that confirm each other
 _AGREEING = 0.3  # least share of the keyframes of an agreeing path that agree
 _MAX_PATHS = 200  # largest number of such paths; along longer sessions they lie farther apart
 _SEARCHED = 8  # largest number of paths that are searched for elsewhere
@@ -313,18 +312,15 @@ def repeated_paths(
     for path in paths:
         members = [guest[index] for index in path]
         fits = [fit for search in searches if (fit := search.likely(members)) is not None]
-        away = [lie.apart(fit.T_map_lidar, members[len(members) // 2].T_odom_lidar) for fit in fits]
-        repeated += any(
-            fit.is_ambiguous or off_m >= _AGREE_M or off_rad >= _AGREE_RAD
-            for fit, (off_m, off_rad) in zip(fits, away, strict=True)
-        )
+        T = members[len(members) // 2].T_odom_lidar
+        repeated += any(fit.is_ambiguous or not lie.agree(fit.T_map_lidar, T, *_AGREE) for fit in fits)
     return repeated, len(paths)
 
 
 def _joining(joined: Joined, old: int) -> NDArray[np.int64]:
     """Keyframes from ``old`` on that a closure in force joins to those before."""
     pairs = joined.edges.pairs
-    return np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE), 1])
+    return np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > DOWNWEIGHTED), 1])
 
 
 def _overlap(joined: Joined, old: int) -> float:
