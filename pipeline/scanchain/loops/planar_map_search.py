@@ -22,7 +22,7 @@ from scanchain.loops.verification import Verifier
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
 from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
-from scanchain.registration.search import Search, draw_surfaces
+from scanchain.registration.search import POINTS, Search, draw_surfaces
 
 # of the newest keyframes in older ones, within the drift
 _HEADING = (0.1, 0.2)  # rad and rad/m, half width of the window in heading: at least, and by the uncertainty
@@ -31,16 +31,16 @@ _WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # a second answ
 # of a path in a whole map
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
 _CERTAIN = 0.6  # log-odds of occupancy above which a cell is a surface, and below minus which it is free
-_POINTS, _MORE_POINTS = 120, 800  # number of points that poses are searched with and compared with
+_MORE_POINTS = 800  # number of points that poses are compared with
 _IN_MAP = Wanted(apart_m=1.0, rival=0.75, answers=12, least=0.35)  # a rival means ambiguity
 _APART_RAD = 0.2  # least angle of two distinct poses
 _CHANCE = 2.0  # over the root of the number of points: share above the least that is reached by chance
 _CERTAINLY = 0.06  # least share above these for a location to count as found
 _CLEAR_M = 2.0  # least path since an ambiguous search for a location to count as found
-_PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
+PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 
 # of the scans of a path that was found
-_AGREE = (0.5, 0.1)  # m and rad, largest distance of an aligned scan from where its path was found
+AGREE = (0.5, 0.1)  # m and rad, largest distance of an aligned scan from where its path was found
 _SOURCES, _SUBMAPS = 8, 6  # keyframes of the path that are aligned, about 1 m apart, and submaps tried for each
 _NEAR_M = 8.0  # largest distance of such a submap's anchor
 
@@ -109,7 +109,7 @@ class PlanarMapSearch:
         Poses are searched with some of the points, in slices of equal work; those found are compared with more.
         """
         points = np.random.default_rng(0).permutation(downsample(points, self.resolution_m))
-        search = Search(points[:_POINTS], self.grid, None, _IN_MAP._replace(least=least))
+        search = Search(points[:POINTS], self.grid, None, _IN_MAP._replace(least=least))
         more, step_rad = points[:_MORE_POINTS].copy(), 0.5 * search.turn_rad
         found = yield from candidates(search, lambda T: [self.grid.climbed(more, T, step_rad)])
         if not found:
@@ -204,7 +204,7 @@ class PlanarFinder:
             submap = self.submaps.around(anchor.index, keyframes, len(keyframes) - 1)
             verified = self.verifier.scan(source, submap, T_first)
             off_m, problem = lie.apart(T_first, verified.match.T_target_source)[0], None
-            if not lie.agree(T_first, verified.match.T_target_source, *_AGREE):
+            if not lie.agree(T_first, verified.match.T_target_source, *AGREE):
                 where = "from where the path was found"
                 problem = Problem(f"far {where}", f"{off_m:.1f} m {where}")
             closure = verified.closure(anchor.index, source.index, Proposal.PLACE, problem=problem)
@@ -222,6 +222,6 @@ def _are_apart(T: Pose, T_other: Pose) -> bool:
 def _path_begin(keyframes: Sequence[Keyframe], start: int) -> int:
     """The first keyframe, from ``start`` on, of the path whose points are searched for."""
     first = len(keyframes) - 1
-    while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= _PATH_M:
+    while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= PATH_M:
         first -= 1
     return first

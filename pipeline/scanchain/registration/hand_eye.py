@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 
-PAIR_M, _TURN_M_RAD = 0.3, 0.5  # least path length of a pair of motions; path length per rad of rotation
+PAIR_M, TURN_M_RAD = 0.3, 0.5  # least path length of a pair of motions; path length per rad of rotation
 _FEWEST, _LEARNED = 6, 1.2  # least number of pairs, for four unknowns; growth of it before the next estimate
-_ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; initial and smallest σ of a residual
+_USUAL_M, _LEAST_M = 0.02, 0.002  # initial and smallest σ of a residual of the robust regression
 _PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information: position to 1 m, the rest nearly free
 _LARGEST_SHARE = 0.25  # residual as a share of the motions, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of an observable yaw and position
@@ -93,14 +93,14 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
 
 def path_m(motions: Matrix) -> NDArray[np.float64]:
     """Lengths (...) of motions (..., d+1, d+1), turns on the spot included."""
-    return np.linalg.norm(motions[..., :-1, -1], axis=-1) + _TURN_M_RAD * lie.rotation_angle(motions)
+    return np.linalg.norm(motions[..., :-1, -1], axis=-1) + TURN_M_RAD * lie.rotation_angle(motions)
 
 
 def _solved(J: Matrix, z: Matrix) -> tuple[NDArray[np.floating], NDArray[np.float64], float]:
     """Covariance (4, 4) and value (4,) of J (M, 2, 4) p = z (M, 2), with the prior; median residual."""
     weight, variance = np.ones(len(z)), _USUAL_M**2
     H, p, residuals = np.eye(4), np.zeros(4), np.zeros(len(z))
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + _PRIOR
         p = np.linalg.solve(H, np.einsum("mij,m,mi->j", J, weight, z) / variance)
         residuals = np.linalg.norm(z - J @ p, axis=1)

@@ -22,7 +22,7 @@ _SIZE = 2**_TOP
 _MIN_RANGE = 10.0  # least median range, in cells, for the step of the headings
 _ADDITIONS = 250_000_000  # of scores per slice of a search, 20 to 40 ms
 _STEPS = 150_000  # windows that are split per slice
-_POINTS = 120  # largest number of points of a planar scan that are scored, one per cell, evenly spread
+POINTS = 120  # largest number of points of planar scans that are scored, one per cell
 _TALL = 0.75  # cells between lowest and highest point of a column, above which it is upright structure
 
 
@@ -221,8 +221,8 @@ def evenly(points: Points, most: int) -> Points:
 
 
 def thinned(points: Points, size_m: float) -> Points:
-    """Points (N, 2) of a scan, downsampled to one per cell and at most _POINTS."""
-    return evenly(downsample(points, size_m), _POINTS)
+    """Points (N, 2) of a scan, downsampled to one per cell and at most POINTS, evenly spread."""
+    return evenly(downsample(points, size_m), POINTS)
 
 
 def upright_columns(points: Points, size_m: float) -> Points:

@@ -19,7 +19,7 @@ from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import SequentialPlaceTest, compared
-from scanchain.loops.planar_map_search import PlanarMapSearch
+from scanchain.loops.planar_map_search import AGREE, PATH_M, PlanarMapSearch
 from scanchain.loops.upright_search import MEMBERS, UprightMap
 from scanchain.maps import Edges, SavedMap
 from scanchain.placement import loop_information
@@ -31,8 +31,7 @@ _NEW_M = 5.0  # distance from older keyframes, at full scale, beyond which a key
 _NEW_KEYFRAMES = 3  # least number of them for which maps that were not found are searched for again
 _MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # least share of contradictions reported, and ratio to that within maps
 _WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
-_PATH_M, _STEP_M = 8.0, 2.0  # length of paths in 2D that are searched for as a whole, and spacing
-_AGREE = (0.5, 0.1)  # m and rad, largest difference between poses that confirm each other
+_STEP_M = 2.0  # spacing of paths in 2D that are searched for as a whole
 _AGREEING = 0.3  # least share of the keyframes of an agreeing path that agree
 _MAX_PATHS = 200  # largest number of such paths; along longer sessions they lie farther apart
 _SEARCHED = 8  # largest number of paths that are searched for elsewhere
@@ -303,7 +302,7 @@ def repeated_paths(
     """
     searches = [PlanarMapSearch(part, config.local_map.voxel_size_m) for part in (host, guest)]
     traveled_m = np.array([keyframe.traveled_m for keyframe in guest]) - guest[0].traveled_m
-    length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
+    length_m = max(min(PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
     step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
     begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
     ends = np.unique(np.searchsorted(traveled_m, [begin_m, begin_m + length_m]), axis=1).T.tolist()
@@ -313,7 +312,7 @@ def repeated_paths(
         members = [guest[index] for index in path]
         fits = [fit for search in searches if (fit := search.likely(members)) is not None]
         T = members[len(members) // 2].T_odom_lidar
-        repeated += any(fit.is_ambiguous or not lie.agree(fit.T_map_lidar, T, *_AGREE) for fit in fits)
+        repeated += any(fit.is_ambiguous or not lie.agree(fit.T_map_lidar, T, *AGREE) for fit in fits)
     return repeated, len(paths)
 
 
