@@ -15,8 +15,6 @@ from scanchain.errors import InputError, ScanchainError, counted, folded
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
 
-_DAY_S = 86_400.0  # time limit of a log where none is given
-
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
@@ -101,7 +99,7 @@ def batch(
         overrides=overrides,
         arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in overrides)),
         workers=workers or os.cpu_count() or 1,
-        time_s=time_s or _DAY_S,
+        time_s=time_s or 86_400.0,
         **limits,
     )
     from scanchain_viz.report.batch import write_batch_report

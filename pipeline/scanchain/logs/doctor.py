@@ -30,11 +30,8 @@ _GAP_PERIODS = 2.5  # longest time between scans, in periods, that is not a gap
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0  # longest gap over which the motion is predicted reliably
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # scan duration over period outside which a time unit is implausible
 _FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
-_LEAST_STEP_M = 1e-3  # distance between two wheel readings above which the robot moves
 _MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
-_STUCK_SHARE = 0.01  # share of beams at the farthest range above which it is reported
 _FEW_POINTS = 50  # number of returns below which matches are weak
-_SAME_M = 1e-4  # largest difference of ranges that count as equal: rounding of float32
 
 
 class Severity(StrEnum):
@@ -140,7 +137,7 @@ class Survey:
         if scan.fixes is not None:
             self.fixes.append(scan.fixes)
         ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
-        at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M))
+        at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - 1e-4))  # rounding of float32
         percentiles_m = ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)]
         span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan
         counts, farthest_m = (len(ranges_m), scan.dropped), round(float(ranges_m[-1]), 4)
@@ -255,7 +252,7 @@ def _wheel_speed_m_s(seen: Survey) -> float:
     stamps_ns, order = np.unique([stamp_ns for stamp_ns, _ in seen.wheels], return_index=True)
     positions = np.array([seen.wheels[k][1] for k in order])
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    moving = steps_m > _LEAST_STEP_M
+    moving = steps_m > 1e-3  # m
     return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
 
 
@@ -391,7 +388,7 @@ def _no_return(seen: Survey) -> Finding:
     farthest_m = max(values)
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.valid + scan.invalid for scan in seen.scans), 1)
-    if share < _STUCK_SHARE:
+    if share < 0.01:
         return Finding("no return", Severity.OK, "no range is so frequent that it would indicate no return")
     found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest range"
     effect = "if it indicates no return, it is matched like a wall that moves along"

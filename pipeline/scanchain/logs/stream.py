@@ -56,7 +56,6 @@ class Span(NamedTuple):
 
 
 _LONG_GAP_NS = 60_000_000_000  # longest time without any message that is not reported
-_LONGEST_GAP_NS = 86_400_000_000_000  # longest time between two files of one log: a day
 _BLOCKS_AHEAD = 4  # largest number of decoded blocks that wait, twice as many of a remote log
 _MOST_BYTES_AHEAD = 256_000_000  # largest decompressed size of the blocks that wait; limits memory
 
@@ -112,7 +111,7 @@ def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
     }
     for before, after in _long_gaps(indexes, config, scanned):
         gap_ns = after.start_ns - before.end_ns
-        if before.file != after.file and gap_ns > _LONGEST_GAP_NS:
+        if before.file != after.file and gap_ns > 86_400_000_000_000:  # a day
             raise InputError(
                 f"{indexes[before.file].path} ends {duration(1e-9 * gap_ns)} before {indexes[after.file].path} "
                 "begins, so they are not parts of one log; run each separately, or all with scanchain batch"

@@ -18,7 +18,7 @@ from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, VoxelSubm
 from scanchain.loops.verification import Verification, Verifier
 
 RECOGNIZERS = {"outline": "scanchain.loops.upright_search:OutlineRecognizer"}
-PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
+PLACE_DRIFT = 0.1  # largest error of the position by odometry, as a share of the path between
 _PLACE_SIGMAS = 3.0  # the same in standard deviations of the prediction by the graph, where these allow more
 _SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps along the path
 

@@ -19,7 +19,6 @@ from scanchain.kernels.voxels import EMPTY
 from scanchain.threads import threads
 
 MAX_VOXELS = 16_000_000  # largest number of voxels: a gigabyte
-_FIRST_VOXELS = 1 << 14
 
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
 _REACH_BINS = 1.5  # width of a bin in voxels at the farthest range that a scan is used to
@@ -46,7 +45,7 @@ class PointMap:
         self.voxel_size_m = voxel_size_m
         self.max_voxels = max_voxels
         self.center_m = np.zeros(3)
-        self._allocate(min(_FIRST_VOXELS, max_voxels))
+        self._allocate(min(1 << 14, max_voxels))
 
     def __len__(self) -> int:
         return self.used

@@ -33,7 +33,6 @@ VIRIDIS = (
 )  # fmt: skip
 _REACH = 0.5  # share of the range of ``MIDDLE`` beyond which a point of a map is an outlier
 _ALL_BUT_FEW = (0.05, 99.95)  # percentiles of the other points that are shown
-_PNG_INCHES = 8.0  # width of a PNG
 _NO_POINTS = np.empty((0, 3))
 _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of 3D points, by height
 
@@ -192,7 +191,7 @@ def draw_map(
     corners = [line.positions[:, :2] for line in lines] + ([np.array(extent(seen))] if len(seen) else [])
     low, high = around(np.concatenate(corners))
     figure = over_map(lines, points, low, high, grid=grid, colors=_INKS, path=path)
-    write_png(picture, [(title, figure)], width_inches=_PNG_INCHES)
+    write_png(picture, [(title, figure)], width_inches=8.0)
 
 
 def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:

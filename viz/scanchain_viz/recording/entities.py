@@ -66,8 +66,6 @@ CYAN, PALE_GREEN = (70, 210, 210), (190, 240, 160)
 
 _HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
 
-_BACKGROUND = (13, 16, 17)  # of scenes, also in a light viewer: lines of ground truth are white
-_PLAY_S = 30.0  # seconds in which a recording is played
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, except in the first scans, which load the kernels
 
 # a list, since the viewer wraps its lines but cuts off those of a table
@@ -167,7 +165,7 @@ def with_panels(root: rrb.Container | rrb.View, *, scans: int = 0, has_toggles: 
     """Views with collapsed panels around them; with ``has_toggles`` the list of entities is expanded."""
     return rrb.Blueprint(
         root,
-        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S)),
+        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / 30.0)),  # in 30 s
         rrb.BlueprintPanel(state="expanded" if has_toggles else "collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
@@ -210,7 +208,7 @@ def scene(
         origin=WORLD,
         name=name,
         overrides=overrides,
-        background=_BACKGROUND,
+        background=(13, 16, 17),  # also in a light viewer: lines of ground truth are white
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye,
     )

@@ -31,7 +31,6 @@ from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import Sink, file_sink, is_readable, open_stream, send_layout, viewer_sink
 
 _LISTED = 50  # largest number of segments in the text of a verdict
-_RADIUS = 3.5  # of a segment's line, in UI points
 
 
 @dataclass(eq=False)
@@ -254,7 +253,7 @@ def _verdict(judged: Judged, trajectory: Trajectory) -> Iterator[Message]:
     lines = rr.LineStrips3D(
         strips,
         colors=[rgb(color_of_kind(each.kind)) for each in judged.segments],
-        radii=drawing.pixels(_RADIUS),
+        radii=drawing.pixels(3.5),
         labels=[str(each.kind) for each in judged.segments],
         show_labels=False,
     )

@@ -35,9 +35,6 @@ from scanchain_viz.recording.entities import scene, up_to_now, whole_log, with_p
 from scanchain_viz.recording.sinks import write_recording
 from scanchain_viz.report import comparison, maps, problems
 
-_MAP_POINTS = 300_000  # largest number of points of a map in the viewer
-_COMPARED_POINTS = 60_000  # of each method's map
-_HEADROOM = 1.2  # factor over the 99th percentile at which a plot ends
 _PLOTS = (  # name, title, field of a trajectory, factor to the unit
     ("error", "position error [m]", "error_m", 1.0),
     ("time", "time per scan [ms]", "seconds", 1e3),
@@ -51,7 +48,6 @@ _RADII = {  # of points of a map, in UI points: changes stand out
 }
 _FINAL, _SIGMA = "world/final", "plots/sigma"
 _MATCHED, _UNMATCHED = "world/matches/accepted", "world/matches/rejected"
-_MAX_SCAN_POINTS = 5_000  # largest number of points of a scan in a recording of all scans
 
 
 def present_comparison(directory: Path) -> None:
@@ -92,7 +88,7 @@ def _of_method(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: NDArray[n
     yield Message(f"world/{name}/lidar", drawing.dots(color=color, radius=5.0))
     yield Message(f"world/{name}/lidar", places, times)
     if map_file.exists():
-        points = drawing.at_most(read_ply(map_file), _COMPARED_POINTS)
+        points = drawing.at_most(read_ply(map_file), 60_000)
         red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
         yield Message(f"world/{name}/map", drawing.dots(points, (red, green, blue), 0.5))
     for plot, _, field, scale in _PLOTS:
@@ -109,7 +105,7 @@ def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
     for plot, name, field, scale in _PLOTS:
         values = np.concatenate([np.empty(0), *(scale * getattr(each, field) for each in trajectories)])
         if np.isfinite(values).any():
-            highest = _HEADROOM * float(np.nanpercentile(values, 99.0))
+            highest = 1.2 * float(np.nanpercentile(values, 99.0))
             legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == "time")
             axes = {"axis_x": whole_log(), "axis_y": rrb.ScalarAxis(range=(0.0, highest))}
             views.append(rrb.TimeSeriesView(origin=f"plots/{plot}", name=name, plot_legend=legend, **axes))
@@ -126,7 +122,7 @@ def present_merge(directory: Path) -> None:
 
 
 def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
-    points = drawing.at_most(read_ply(directory / "map.ply"), _MAP_POINTS)
+    points = drawing.at_most(read_ply(directory / "map.ply"), 300_000)
     yield Message(entities.MAP, drawing.dots(points, entities.GRAY, 0.75))
     yield Message(entities.ACCEPTED, drawing.lines(drawn.closures.astype(np.float32), entities.GREEN, 0.75))
     for session in drawn.sessions:
@@ -220,7 +216,7 @@ def _localized(localized: LocalizedLog) -> Iterator[Message]:
         yield Message(entities.LIDAR, drawing.transforms(found.live[placed]), times[placed])
     for keyframe in keyframes[len(localized.prior.keyframes) :]:
         if placed[keyframe.scan_index]:
-            points = drawing.at_most(keyframe.points, _MAX_SCAN_POINTS)
+            points = drawing.at_most(keyframe.points, 5_000)
             yield Message(entities.SCAN, drawing.dots(points), times[np.array([keyframe.scan_index])])
     for closure in found.closures:  # hypotheses while it searches, matches then
         T_map_target = keyframes[closure.target].T_odom_lidar
