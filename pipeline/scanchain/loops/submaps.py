@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Points, Pose
-from scanchain.kernels.voxels import DIRECTION, PLANE, SHAPE
+from scanchain.kernels.voxels import PLANE, Cell
 from scanchain.loops.connectivity import Segments
 from scanchain.registration import VoxelMap
 
@@ -134,7 +134,7 @@ def level_frame(keyframe: Keyframe, config: LocalMapConfig) -> Pose:
     voxels = VoxelMap(3, config, keyframe.scale, keyframe.noise_m)
     voxels.insert(keyframe.points, lie.identity(3))
     cells = voxels.voxels.cells[: len(voxels)]
-    normals = cells[cells[:, SHAPE] == PLANE, DIRECTION : DIRECTION + 3]
+    normals = cells[cells[:, Cell.SHAPE] == PLANE, Cell.DIRECTION : Cell.DIRECTION + 3]
     up = np.array([0.0, 0.0, 1.0])
     for cosine in _CONES:
         along = normals @ up

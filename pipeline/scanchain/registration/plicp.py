@@ -17,12 +17,7 @@ from scanchain.kernels.registration.match import Result, match
 from scanchain.kernels.registration.residuals import Settings
 from scanchain.registration.voxel_map import VoxelMap
 
-OPTIMIZERS = {
-    "gradient-descent": icp.GRADIENT_DESCENT,
-    "newton": icp.NEWTON,
-    "gauss-newton": icp.GAUSS_NEWTON,
-    "levenberg-marquardt": icp.LEVENBERG_MARQUARDT,
-}
+OPTIMIZERS = {each.name.lower().replace("_", "-"): int(each) for each in icp.Optimizer}
 
 _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is always searched; limit in voxels
 _LEAST_OVERLAP = 0.75  # least share of points with a correspondence; correct poses in simulations exceed it
