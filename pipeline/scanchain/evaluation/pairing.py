@@ -13,8 +13,8 @@ from scanchain.data import Matrix, Trajectory, brief
 from scanchain.errors import InputError, counted
 from scanchain.trajectory import read_kitti, read_tum, text_lines
 
-_WIDEST_GAP_S = 0.6  # default widest gap in the reference: at 1 m/s² a line is up to 5 cm off within it
-_SHORTEST_GAP_S = 0.1  # least default gap: at 1 m/s² a straight line is up to 1.3 mm off within it
+# least and most of the default widest gap: at 1 m/s² a straight line is up to 1.3 mm and up to 5 cm off within it
+_GAPS_S = (0.1, 0.6)
 _INTERVALS = 5.0  # median intervals of the reference that the default widest gap has at least
 _ERRORS_S = (1e-6, 5e-4)  # largest of a stamp that was a floating-point number of seconds, or in milliseconds
 _FEW = 10  # number of poses below which their error has little meaning
@@ -113,7 +113,7 @@ class Pairs:
             )
         elif len(self) < _FEW:
             lines.append(f"accuracy is that of {counted(len(self), 'pose')} alone")
-        if self.widest_s > _WIDEST_GAP_S:
+        if self.widest_s > _GAPS_S[1]:
             lines.append(
                 f"true poses are up to {self.widest_s:.3g} s apart, and the path between them is taken as straight"
             )
@@ -135,7 +135,7 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     order = np.argsort(reference.stamps_ns, kind="stable")
     stamps_ns, wanted_ns = reference.stamps_ns[order], estimate.stamps_ns
     interval_ns = _usual_interval_ns(stamps_ns)
-    default_s = min(max(_INTERVALS * 1e-9 * interval_ns, _SHORTEST_GAP_S), _WIDEST_GAP_S)
+    default_s = min(max(_INTERVALS * 1e-9 * interval_ns, _GAPS_S[0]), _GAPS_S[1])
     gap_ns = 1e9 * (default_s if gap_s is None else gap_s)
     index, difference_ns = nearest(wanted_ns, reference.stamps_ns)
     after = np.searchsorted(stamps_ns, wanted_ns, side="right")

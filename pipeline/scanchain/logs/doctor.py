@@ -27,8 +27,8 @@ from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
 _GAP_PERIODS = 2.5  # longest time between scans, in periods, that is not a gap
-_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0  # longest gap over which the motion is predicted reliably
-_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # scan duration over period outside which a time unit is implausible
+_LONG_GAP_S = (0.5, 10.0)  # longest gap over which the motion is predicted reliably, and with wheels
+_PARTS = (0.3, 1.2)  # scan duration over period outside which a time unit is implausible
 _FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
 _MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
 _FEW_POINTS = 50  # number of returns below which matches are weak
@@ -194,7 +194,7 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     longest_s, at_s = steps_s[longest], seen.log_time_s(longest)
     found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, {at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
-    if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
+    if longest_s < _LONG_GAP_S[is_on_wheels]:
         return Finding("gaps", Severity.NOTE, found, effect)
     effect += (
         "; after a long gap a match may converge to a wrong pose: run the part before, as below, and the rest, "
@@ -310,7 +310,7 @@ def _point_times(seen: Survey) -> Finding:
     assumed = times.assumed.removeprefix("point times").lstrip(": ") or "time_increment of the beams"
     found = f"{assumed}; a scan lasts {1e3 * span_s:.4g} ms"
     part = span_s / seen.period_s if seen.period_s else 1.0
-    if is_scan(seen.log.lidar) or _PART_OF_SCAN < part < _MORE_THAN_SCAN:
+    if is_scan(seen.log.lidar) or _PARTS[0] < part < _PARTS[1]:
         grade = Severity.WARNING if untimed else Severity.NOTE if faults else Severity.OK
         effect = f"{counted(untimed, 'scan')} without: {distorted}" if untimed else "the rest is used"
         return Finding("point times", grade, "; ".join([found, *faults]), effect if faults else "")
@@ -328,9 +328,9 @@ def _other_unit(assumed: str, part: float) -> str:
     if not current:
         return ""
     for unit, unit_s in UNITS_S.items():
-        if unit != current and _PART_OF_SCAN < part * unit_s / UNITS_S[current] < _MORE_THAN_SCAN:
+        if unit != current and _PARTS[0] < part * unit_s / UNITS_S[current] < _PARTS[1]:
             return f"--log.point_times {unit}"
-    return "--log.point_times none" if part > _MORE_THAN_SCAN else ""
+    return "--log.point_times none" if part > _PARTS[1] else ""
 
 
 def _damage(seen: Survey, preprocess: PreprocessConfig, most_bad: float) -> Finding:

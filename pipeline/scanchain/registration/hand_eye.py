@@ -16,7 +16,8 @@ _USUAL_M, _LEAST_M = 0.02, 0.002  # initial and smallest σ of a residual of the
 _PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information: position to 1 m, the rest nearly free
 _LARGEST_SHARE = 0.25  # residual as a share of the motions, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of an observable yaw and position
-_OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # least negative correlation of turns, and turn, to find a lidar upside down
+OPPOSED = 0.5  # least negative correlation of turns of a mirrored sensor
+_LEAST_TURN_RAD = 0.3  # least turn to find a lidar upside down
 _APART_M, _EXPLAINED = 0.2, 0.5  # least offset and largest ``left`` of a mounting other than identity
 
 
@@ -71,7 +72,7 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
     if len(base) < _FEWEST:
         return None
     turn, theta = lie.log(base)[:, -1], lie.log(lidar)[:, -1]
-    is_opposed = turn @ theta < -_OPPOSED * np.linalg.norm(turn) * np.linalg.norm(theta)
+    is_opposed = turn @ theta < -OPPOSED * np.linalg.norm(turn) * np.linalg.norm(theta)
     up = -1.0 if is_opposed and np.linalg.norm(turn) > _LEAST_TURN_RAD else 1.0
     c, s, x, y = np.cos(theta) - 1.0, up * np.sin(theta), lidar[:, 0, -1], up * lidar[:, 1, -1]
     J = np.stack([np.stack([c, -s, -x, y], axis=1), np.stack([s, c, -y, -x], axis=1)], axis=1)  # (M, 2, 4)

@@ -29,7 +29,6 @@ _SHARES = (0.02, 0.05)  # m/m and rad/m: limits of the learned σ of the wheels
 
 _MEDIAN_LIMIT = 2.0  # largest median innovation; about 1 where calibration and σ are right
 _LEAST_TURN_RAD = 1.0  # rotation of the wheels over a log below which its direction is not compared
-_OPPOSED = -0.5  # ratio of the rotations of trajectory and wheels below which one of the two is mirrored
 _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
 
 _FEWEST, _MOST = 3, 20  # least and largest number of closures around a segment that decide; the shortest are used
@@ -151,7 +150,7 @@ class Wheels(Check):
 
     def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Wheels that turn opposite, or that disagree throughout by more than the largest σ learned for them."""
-        if self.turn_ratio < _OPPOSED:
+        if self.turn_ratio < -hand_eye.OPPOSED:
             yield (
                 "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down "
                 "that /tf_static does not state so: --log.upside_down true), or the wheels are"

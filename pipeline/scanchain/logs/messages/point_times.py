@@ -42,9 +42,7 @@ _DENSE = 0.85  # smallest share of the core in the span of a sweep without outli
 _LONGEST, _MOST_PERIODS = 2.5, 10.0  # longest sweep without outliers in usual spans, and any sweep in periods
 _STEP = 0.25  # share of the usual span above which a step back starts a row, or is a reset of the counter
 _PART_OF_TURN = 0.6  # smallest share of the time of a turn that its beams take
-_SPANS = 100  # number of first scans whose spans are compared with the period
-_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # limits of a span as a share of the period: outside, the unit is wrong
-_ROUNDING_RAD = 1e-6  # of an azimuth of a point in float32
+_PARTS = (0.005, 2.0)  # limits of a span as a share of the period: outside, the unit is wrong
 
 _LEFT_OUT = "contradict the others: these points are left out"
 _UNWRAPPED = "step back where a counter wrapped or was reset: repaired"
@@ -250,8 +248,9 @@ class PointTimes:
 
     def warnings(self, topic: str) -> list[str]:
         """Warning if by the period the times of sweeps are in another unit."""
-        span_s, period_s = (median_low(each[:_SPANS] or [0.0]) for each in (self.spans_s, self.periods_s))
-        if not span_s or not period_s or _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
+        # of the first scans
+        span_s, period_s = (median_low(each[:100] or [0.0]) for each in (self.spans_s, self.periods_s))
+        if not span_s or not period_s or _PARTS[0] < span_s / period_s < _PARTS[1]:
             return []
         return [
             f"by their point times scans of {topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} of the "
@@ -333,7 +332,7 @@ def from_azimuth(points: RawPoints, config: LogConfig) -> NDArray[np.float32]:
     """Times (N,) of points (N, d) by the azimuth from that of the lidar at the stamp."""
     sense = -1.0 if config.point_times == "clockwise" else 1.0
     turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad) % (2.0 * np.pi)
-    turned[turned > 2.0 * np.pi - _ROUNDING_RAD] = 0.0  # else the first ray may be the last one
+    turned[turned > 2.0 * np.pi - 1e-6] = 0.0  # else the first ray may be the last one
     return (turned * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
 
 

@@ -388,7 +388,7 @@ def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng:
 
 # the yard
 
-_YARD_X_M, _YARD_Y_M = 19.0, 15.0  # half the length and half the width between its walls
+_YARD_M = (19.0, 15.0)  # half the length and half the width between its walls
 
 YARD_ROBOT = Vehicle(
     speed_m_s=1.5, acceleration_m_s2=1.5, lateral_acceleration_m_s2=1.0, sway_rad=0.006, heave_m=0.004,
@@ -409,12 +409,12 @@ def yard(rng: np.random.Generator) -> Solids:
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
     scenery = Scenery(np.array([0.0, 0.1, 2.0 * np.pi / 30.0, phase_x, 0.1, 2.0 * np.pi / 24.0, phase_y]))
     for side in (-1.0, 1.0):
-        scenery.box((0.0, side * _YARD_Y_M), (2.0 * _YARD_X_M, 0.3), (BELOW_M, rng.uniform(1.8, 3.0)))
-        scenery.box((side * _YARD_X_M, 0.0), (0.3, 2.0 * _YARD_Y_M), (BELOW_M, rng.uniform(1.8, 3.0)))
+        scenery.box((0.0, side * _YARD_M[1]), (2.0 * _YARD_M[0], 0.3), (BELOW_M, rng.uniform(1.8, 3.0)))
+        scenery.box((side * _YARD_M[0], 0.0), (0.3, 2.0 * _YARD_M[1]), (BELOW_M, rng.uniform(1.8, 3.0)))
         for x in np.arange(-15.0, 15.1, 6.0):
-            _lean_on(scenery, float(x) + rng.uniform(-1.0, 1.0), side * (_YARD_Y_M - 2.2), rng)
+            _lean_on(scenery, float(x) + rng.uniform(-1.0, 1.0), side * (_YARD_M[1] - 2.2), rng)
         for y in (-7.0, 0.0, 7.0):
-            parked_car(scenery, side * (_YARD_X_M - 3.0), y + rng.uniform(-1.5, 1.5), rng.normal(0.0, 0.1), rng)
+            parked_car(scenery, side * (_YARD_M[0] - 3.0), y + rng.uniform(-1.5, 1.5), rng.normal(0.0, 0.1), rng)
         tree(scenery, side * rng.uniform(10.5, 12.0), rng.uniform(-6.0, 6.0), rng)
     for bearing in np.deg2rad(np.arange(0.0, 360.0, 60.0)) + rng.uniform(-0.4, 0.4, 6):
         x, y = rng.uniform(7.0, 9.5) * np.array([np.cos(bearing), np.sin(bearing)])
