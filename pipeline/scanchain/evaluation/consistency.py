@@ -30,7 +30,6 @@ _MOST_OPEN = 0.5  # largest standard deviation of the instant of a pose in a dis
 
 RADIUS_M = {2: 0.2, 3: 0.5}  # of the neighborhood whose thickness is measured, by dimension
 REACH_M = 40.0  # largest range of the points that are compared: those farther off are too sparse
-MIN_NEIGHBORS = 10  # fewest points in a neighborhood whose thickness is measured
 MAX_POINTS, MAX_QUERIES = 600_000, 15_000  # of a map, and of them those whose neighborhoods are measured: seconds
 _MIN_COVERAGE = 0.5  # least share of the query points of the best map that another must cover to be compared
 
@@ -402,7 +401,7 @@ def _eigenvalues(points: Points) -> Matrix:
     for begin in range(0, len(queries), 64):  # all neighbors of all queries take gigabytes
         some = queries[begin : begin + 64]
         for row, chosen in enumerate(tree.query_ball_point(some, RADIUS_M[d], return_sorted=False), begin):
-            if len(chosen) >= MIN_NEIGHBORS:
+            if len(chosen) >= 10:  # fewer give no thickness
                 offsets = points[chosen] - queries[row]
                 offsets -= offsets.mean(axis=0)
                 covariances[row] = offsets.T @ offsets / (len(chosen) - 1)

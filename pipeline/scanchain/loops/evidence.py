@@ -16,7 +16,6 @@ from scanchain.loops.connectivity import Segments
 from scanchain.loops.verification import MARGIN_SHARE
 
 _NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes whose free space is compared
-_BINS = 360  # of azimuth, 1°; as fine in elevation
 _MARGIN_M = {2: 0.3, 3: 1.0}  # by which ranges may differ, plus a share of them
 _IN_SIGHT = 0.3  # least share of a keyframe's points in view of the map's nearest one for it to be in sight
 _RISK = 1e-3  # probability that an accepted pose is wrong
@@ -43,7 +42,7 @@ def compared(
     min_path_m : least path between the two
     """
     d = viewers[0].T_odom_lidar.shape[0] - 1
-    ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
+    ranges_m = np.empty((1 if d == 2 else 180, 360))  # by elevation and azimuth: 1°
     positions = np.array([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
     traveled_m = np.array([keyframe.traveled_m for keyframe in viewed])
     counts = np.zeros(2, np.int64)

@@ -14,7 +14,7 @@ from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.config import MapsConfig
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal
-from scanchain.kernels.search import FREE, NEAR, UNKNOWN
+from scanchain.kernels.search import Score
 from scanchain.loops.evidence import rank_of
 from scanchain.loops.place_search import Underway, candidates, completed
 from scanchain.loops.submaps import VoxelSubmaps, seen_together
@@ -98,9 +98,9 @@ class PlanarMapSearch:
         grid.insert_batch(T_map_lidar, np.vstack(clouds), np.append(0, np.cumsum([len(each) for each in clouds])))
         grid = grid.trimmed()
         log_odds = np.pad(grid.log_odds, 1)
-        cells = np.where(log_odds < -_CERTAIN, FREE, UNKNOWN).astype(np.int8)
+        cells = np.where(log_odds < -_CERTAIN, Score.FREE, Score.UNKNOWN).astype(np.int8)
         draw_surfaces(cells, *np.nonzero(log_odds > _CERTAIN))
-        room = (cells == FREE) | (cells == NEAR)
+        room = (cells == Score.FREE) | (cells == Score.NEAR)
         self.grid = SearchGrid(cells, grid.origin_m - self.resolution_m, self.resolution_m, room)
 
     def sought(self, points: Points, least: float = _IN_MAP.least) -> Generator[None, None, Hypothesis | None]:

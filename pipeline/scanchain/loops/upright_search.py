@@ -27,7 +27,7 @@ from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, Search, evenly, upright_columns
 
 # of every search
-_COLUMNS, _MIN_COLUMNS = 150, 30  # numbers of columns that are scored, evenly spread, and least for a search
+_COLUMNS = (30, 150)  # least number of columns for a search, and most that are scored, evenly spread
 _APART = 4.0  # least distance of two distinct poses, cells
 _REFINED_RAD = 0.15  # half width in heading of the window around a coarse pose in which it is refined
 
@@ -96,7 +96,7 @@ class OutlineRecognizer:
         newest, keyframes, limits = self.outlines[-1], query.keyframes, self.config.loops
         here, radius_m = query.submap.anchor, query.submap.radius_m
         old = [each for each in self.outlines if keyframes[each.anchor].traveled_m <= query.max_traveled_m]
-        if not old or len(newest.columns) < _MIN_COLUMNS:
+        if not old or len(newest.columns) < _COLUMNS[0]:
             return []
         T_old, T_expected = _in_plane(old, newest, query)
         path_m = here.traveled_m - np.array([keyframes[each.anchor].traveled_m for each in old])
@@ -110,7 +110,7 @@ class OutlineRecognizer:
         window = Window(T_expected, within_m, _HEADING_RAD)
         # half of the columns is hidden from the other side
         wanted = Wanted(apart_m=_APART * size_m, rival=0.9, answers=8, least=0.4)
-        found = find(evenly(newest.columns, _COLUMNS), SearchGrid.of_points(combined, size_m), window, wanted)
+        found = find(evenly(newest.columns, _COLUMNS[1]), SearchGrid.of_points(combined, size_m), window, wanted)
         poses = np.array([each.T_target_source for each in found]).reshape(-1, 3, 3)
         candidates: list[Candidate] = []
         for T in poses:
@@ -207,8 +207,8 @@ class UprightMap:
     def seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
         """The best poses (3, 3) of points in the level frame of the map, from a coarse search, then refined."""
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
-        columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
-        if len(columns) < _MIN_COLUMNS or not len(self.columns):
+        columns = evenly(upright_columns(near, self.size_m), _COLUMNS[1])
+        if len(columns) < _COLUMNS[0] or not len(self.columns):
             return ()
         if self.grid is None:
             self.grid = self._rasterized()
@@ -343,4 +343,4 @@ def _refined(
     """The pose of columns (N, 2) near a coarse one that fits other columns (M, 2) best; empty if none fits."""
     around = Window(T, half_width_m, _REFINED_RAD)
     wanted = Wanted(_APART * size_m, 1.0, 1, least)
-    return find(evenly(columns, _COLUMNS), SearchGrid.of_points(surfaces, size_m), around, wanted)
+    return find(evenly(columns, _COLUMNS[1]), SearchGrid.of_points(surfaces, size_m), around, wanted)

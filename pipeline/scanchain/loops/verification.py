@@ -25,7 +25,6 @@ _MIN_AGREEMENT = 0.87  # least agreement about free space, relative to that of e
 _COARSE = 2.0  # voxel size of the first alignment of two submaps, in usual voxel sizes
 _VIEWS = 8  # number of views of each submap that are compared with the other
 _VERIFIED = "verified by matching"
-_BINS = (90, 180)  # bins of elevation and azimuth: 2° each
 MARGIN_SHARE = 0.05  # least difference of two ranges that contradict each other, as a share of the range
 
 
@@ -156,7 +155,7 @@ def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, 
 
     points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 if no point is in view.
     """
-    ranges_m, points = np.empty(_BINS), np.ascontiguousarray(points)
+    ranges_m, points = np.empty((90, 180)), np.ascontiguousarray(points)  # by elevation and azimuth: 2°
     agreeing = contradicting = 0
     for T_target_lidar, seen in submap.views(_VIEWS):
         nearest_ranges(np.ascontiguousarray(seen), ranges_m)

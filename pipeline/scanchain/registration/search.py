@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from scanchain import lie
 from scanchain.data import Points, Pose
-from scanchain.kernels.search import NEAR, SURFACE, TURNS, climb, score_windows, split_best
+from scanchain.kernels.search import TURNS, Score, climb, score_windows, split_best
 from scanchain.preprocess import downsample
 from scanchain.registration.voxel_map import VoxelMap
 
@@ -111,7 +111,7 @@ class SearchGrid:
         """Local maximum of the score of points (N, 2), in steps of half a cell and ``step_rad``, then finer."""
         pose = np.array([*T[:2, 2], lie.yaw(T)])
         score = climb(self.pyramid[0], points, self.origin_m, self.resolution_m, pose, step_rad)
-        return Found(lie.pose_2d(*pose.tolist()), float(score) / SURFACE)
+        return Found(lie.pose_2d(*pose.tolist()), float(score) / Score.SURFACE)
 
 
 class Search:
@@ -145,7 +145,7 @@ class Search:
         self.has_room = np.asarray(blocks.any(axis=(1, 3)))
         past_last = self.has_room.shape[1] - self.has_room[:, ::-1].argmax(axis=1)  # per row, if any has room
         self.spans = np.column_stack([self.has_room.argmax(axis=1), past_last * self.has_room.any(axis=1)])
-        self.full = SURFACE * len(points)
+        self.full = Score.SURFACE * len(points)
         self.least = max(wanted.least * self.full, 1.0)
         additions = int(np.diff(self.spans).sum()) * len(points)
         self.headings = TURNS * max(_ADDITIONS // max(additions, 1), 1)
@@ -211,8 +211,8 @@ def draw_surfaces(cells: NDArray[np.int8], rows: NDArray[np.int64], columns: NDA
     """Set the scores of cells with surfaces, and of their neighbors; none may lie on the border."""
     for row in (rows - 1, rows, rows + 1):
         for column in (columns - 1, columns, columns + 1):
-            cells[row, column] = np.maximum(cells[row, column], NEAR)
-    cells[rows, columns] = SURFACE
+            cells[row, column] = np.maximum(cells[row, column], Score.NEAR)
+    cells[rows, columns] = Score.SURFACE
 
 
 def evenly(points: Points, most: int) -> Points:

@@ -29,8 +29,7 @@ _APART_M = 200.0  # path assumed between the last keyframe of a map and the firs
 _CLEAR = 0.1  # share of a map's keyframes with a closure in force above which it joins before others are tried
 _NEW_M = 5.0  # distance from older keyframes, at full scale, beyond which a keyframe is in a new area
 _NEW_KEYFRAMES = 3  # least number of them for which maps that were not found are searched for again
-_MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # least share of contradictions reported, and ratio to that within maps
-_WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
+_CHANGE = (0.025, 3.0)  # least share of contradictions that is reported, and its ratio to that within maps
 _STEP_M = 2.0  # spacing of paths in 2D that are searched for as a whole
 _AGREEING = 0.3  # least share of the keyframes of an agreeing path that agree
 _MAX_PATHS = 200  # largest number of such paths; along longer sessions they lie farther apart
@@ -248,8 +247,9 @@ def changed(joined: Joined) -> dict[int, float]:
     parts = {
         number: [joined.keyframes[k] for k in np.flatnonzero(joined.of_map == number)] for number in joined.maps
     }
-    agreeing, contradicting = sum((compared(part, part, _WITHIN_M) for part in parts.values()), np.zeros(2))
-    least = max(_MIN_CHANGE, _TIMES_WITHIN * contradicting / max(agreeing + contradicting, 1))
+    # least path between two keyframes of one map
+    agreeing, contradicting = sum((compared(part, part, 1.0) for part in parts.values()), np.zeros(2))
+    least = max(_CHANGE[0], _CHANGE[1] * contradicting / max(agreeing + contradicting, 1))
     found: dict[int, float] = {}
     for number in joined.maps[1:]:
         others = [k for other, part in parts.items() if other != number for k in part]

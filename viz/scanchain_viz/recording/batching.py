@@ -78,7 +78,9 @@ class KeyframeGraph:
             return nodes[np.array(pairs, np.int64).reshape(-1, 2)]
 
         accepted = self._of(ClosureVerdict.ACCEPTED)
-        colors = [entities.PALE_GREEN if item.weight < DOWNWEIGHTED else entities.GREEN for item in accepted]
+        colors = [
+            entities.Color.PALE_GREEN if item.weight < DOWNWEIGHTED else entities.Color.GREEN for item in accepted
+        ]
         return [
             Message(entities.KEYFRAMES, drawing.dots(nodes), times),
             Message(entities.ODOMETRY_EDGES, drawing.lines([nodes]), times),

@@ -71,7 +71,7 @@ def _compared(directory: Path, trajectories: Sequence[DrawnTrajectory]) -> Itera
     stamps_ns = scans["stamp_ns"].to_numpy()[first]
     if truth_file.exists():
         path = drawing.positions(read_tum(truth_file).poses)
-        yield Message(entities.GROUND_TRUTH, drawing.lines([path], entities.WHITE, 0.75))
+        yield Message(entities.GROUND_TRUTH, drawing.lines([path], entities.Color.WHITE, 0.75))
     for each in trajectories:
         yield from _of_method(each, method_folder(directory, each.name) / MAP_FILE, stamps_ns)
 
@@ -89,7 +89,7 @@ def _of_method(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: NDArray[n
     yield Message(f"world/{name}/lidar", places, times)
     if map_file.exists():
         points = drawing.at_most(read_ply(map_file), 60_000)
-        red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
+        red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.Color.GRAY, strict=True))
         yield Message(f"world/{name}/map", drawing.dots(points, (red, green, blue), 0.5))
     for plot, _, field, scale in _PLOTS:
         values = scale * getattr(trajectory, field)
@@ -123,8 +123,8 @@ def present_merge(directory: Path) -> None:
 
 def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
     points = drawing.at_most(read_ply(directory / "map.ply"), 300_000)
-    yield Message(entities.MAP, drawing.dots(points, entities.GRAY, 0.75))
-    yield Message(entities.ACCEPTED, drawing.lines(drawn.closures.astype(np.float32), entities.GREEN, 0.75))
+    yield Message(entities.MAP, drawing.dots(points, entities.Color.GRAY, 0.75))
+    yield Message(entities.ACCEPTED, drawing.lines(drawn.closures.astype(np.float32), entities.Color.GREEN, 0.75))
     for session in drawn.sessions:
         color, name = rgb(session.color), rr.escape_entity_path_part(session.name)
         path = session.positions.astype(np.float32)
@@ -192,9 +192,9 @@ def present_localization(directory: Path, localized: LocalizedLog) -> None:
     messages = [
         Message(entities.MAP, drawing.dots(points, entities.height_colors(points), 1.0)),
         Message(entities.LIDAR, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
-        Message(entities.SCAN, drawing.dots(color=entities.YELLOW, radius=2.0)),
+        Message(entities.SCAN, drawing.dots(color=entities.Color.YELLOW, radius=2.0)),
         Message(entities.VERDICT, rr.TextDocument(localized.metrics.judged.sentence)),
-        Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.BLUE])),
+        Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.Color.BLUE])),
         Message(entities.STATE, rr.StateConfiguration(values=names, labels=names, colors=colors)),
         *_localized(localized),
     ]
@@ -222,12 +222,12 @@ def _localized(localized: LocalizedLog) -> Iterator[Message]:
         T_map_target = keyframes[closure.target].T_odom_lidar
         ends = drawing.positions(np.stack([T_map_target, T_map_target @ closure.match.T_target_source]))
         is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
-        line = drawing.lines([ends], entities.GREEN if is_accepted else entities.RED, 2.0)
+        line = drawing.lines([ends], entities.Color.GREEN if is_accepted else entities.Color.RED, 2.0)
         when = times[np.array([keyframes[closure.source].scan_index])]
         yield Message(_MATCHED if is_accepted else _UNMATCHED, line, when)
     if found.is_placed.any():
         path = drawing.positions(found.trajectory.poses[found.is_placed])
-        yield Message(_FINAL, drawing.lines([path], entities.CYAN, 1.0))
+        yield Message(_FINAL, drawing.lines([path], entities.Color.CYAN, 1.0))
 
 
 def record_graph(change: GraphChange, path: Path) -> None:
@@ -241,9 +241,9 @@ def record_graph(change: GraphChange, path: Path) -> None:
 def _graph(state: GraphState, when: int) -> Iterator[Message]:
     """Nodes, chain, loops and rejected edges at one instant."""
     times, nodes = Times.at(when, when), drawing.positions(state.poses)
-    yield Message(entities.KEYFRAMES, drawing.dots(nodes, entities.VIOLET, 1.5), times)
+    yield Message(entities.KEYFRAMES, drawing.dots(nodes, entities.Color.VIOLET, 1.5), times)
     names = (entities.ODOMETRY_EDGES, entities.ACCEPTED, entities.REJECTED)
-    colors = (entities.GRAY, entities.GREEN, entities.RED)
+    colors = (entities.Color.GRAY, entities.Color.GREEN, entities.Color.RED)
     for entity, edges, color in zip(names, state.drawn_edges, colors, strict=True):
         yield Message(entity, drawing.lines(nodes[edges], color, 0.75), times)
 
@@ -263,18 +263,18 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
 def _study(root: str, study: Study) -> Iterator[Message]:
     """The true trajectory and landmarks, static, and the estimates at their instants."""
     known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
-    path = drawing.lines([drawing.in_space(study.true_poses)], entities.GRAY, 1.0)
+    path = drawing.lines([drawing.in_space(study.true_poses)], entities.Color.GRAY, 1.0)
     yield Message(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     yield Message(f"{root}/truth/trajectory", path)
-    yield Message(f"{root}/truth/landmarks", drawing.dots(drawing.in_space(known), entities.GRAY, 4.0))
-    yield from _estimate(root, study.before, Times.at(0, 0), entities.ORANGE)
-    yield from _estimate(root, study.after, Times.at(1, 1), entities.BLUE)
+    yield Message(f"{root}/truth/landmarks", drawing.dots(drawing.in_space(known), entities.Color.GRAY, 4.0))
+    yield from _estimate(root, study.before, Times.at(0, 0), entities.Color.ORANGE)
+    yield from _estimate(root, study.after, Times.at(1, 1), entities.Color.BLUE)
     axes_m, angles_rad = problems.ellipses(study)
     drawn = rr.Ellipsoids3D.from_fields(
         centers=drawing.in_space(study.after.in_truth()[1]),
         half_sizes=np.pad(axes_m, ((0, 0), (0, 1)), constant_values=_FLAT_M),
         quaternions=_upright(angles_rad),
-        colors=entities.BLUE,
+        colors=entities.Color.BLUE,
     )
     yield Message(f"{root}/ellipses", drawn, Times.at(1, 1))
 
