@@ -215,10 +215,8 @@ class _Collector:
 def _motions(tracked: Sequence[Tracked]) -> Motions:
     """Motions between consecutive scans whose poses are determined; times since the first scan."""
     stamps_ns = np.array([each.scan.stamp_ns for each in tracked])
-    T, ok = (
-        np.array([each.T_odom_lidar for each in tracked]),
-        np.array([each.state is State.OK for each in tracked]),
-    )
+    T = np.array([each.T_odom_lidar for each in tracked])
+    ok = np.array([each.state is State.OK for each in tracked])
     lasted_ns, ok[0] = np.diff(stamps_ns), False  # the first scan is not deskewed
     is_motion = ok[:-1] & ok[1:] & (lasted_ns > 0) & (lasted_ns < 1e9 * LONGEST_S)
     is_motion &= np.array([not each.is_repeated for each in tracked[1:]])

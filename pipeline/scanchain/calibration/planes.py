@@ -152,10 +152,8 @@ def adjust(
 
 def _contradiction(known: Sequence[_Equations], by: Vector) -> float:
     """Difference, in standard deviations, of a parameter by level and by upright planes; ``by`` : row of M⁻¹."""
-    found, is_level = (
-        np.concatenate([each.scores @ by for each in known]),
-        np.concatenate([each.is_level for each in known]),
-    )
+    found = np.concatenate([each.scores @ by for each in known])
+    is_level = np.concatenate([each.is_level for each in known])
     level, upright = float(np.sum(found[is_level] ** 2)), float(np.sum(found[~is_level] ** 2))
     if not level or not upright:
         return 0.0

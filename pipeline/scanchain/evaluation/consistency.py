@@ -177,11 +177,9 @@ def with_map_errors(
     systematic_drift : the 5; 0 where systematic drift is measured instead
     """
     k, of_scans = graph.freedom, np.flatnonzero(graph.is_odometry | graph.is_loop)
-    source, is_loop, information = (
-        graph.edges[of_scans].max(axis=1),
-        graph.is_loop[of_scans],
-        graph.information.copy(),
-    )
+    source = graph.edges[of_scans].max(axis=1)
+    is_loop = graph.is_loop[of_scans]
+    information = graph.information.copy()
     chosen = [map_errors[index] for index in source.tolist()]
     covariance, by_itself = edge_errors(information[of_scans], is_loop, chosen, config, systematic_drift)
     judged = np.linalg.inv(covariance + 1e-14 * np.eye(k))  # regular at standstill, too

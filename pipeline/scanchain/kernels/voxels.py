@@ -82,11 +82,9 @@ def insert(voxels, points, T, tick: int, alone: float, variance: float):
                     touched[touches] = voxel
                     touches += 1
             (ix, iy, iz), size = unpack(voxels.keys[voxel]), voxels.size_m
-            x, y, z = (
-                moved[i, 0] - (ix + 0.5) * size,
-                moved[i, 1] - (iy + 0.5) * size,
-                moved[i, 2] - (iz + 0.5) * size,
-            )
+            x = moved[i, 0] - (ix + 0.5) * size
+            y = moved[i, 1] - (iy + 0.5) * size
+            z = moved[i, 2] - (iz + 0.5) * size
             add_moments(voxels.moments, voxel, x, y, z)
     for k in range(touches):
         voxel = touched[k]
@@ -221,11 +219,9 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums
         _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
         _fit_shape(sums, dimension, variance, cell)
         if variance > 0.0 and cell[Cell.SHAPE] == PLANE:
-            x, y, z = (
-                sums[1] / sums[0] - m[1] / m[0],
-                sums[2] / sums[0] - m[2] / m[0],
-                sums[3] / sums[0] - m[3] / m[0],
-            )
+            x = sums[1] / sums[0] - m[1] / m[0]
+            y = sums[2] / sums[0] - m[2] / m[0]
+            z = sums[3] / sums[0] - m[3] / m[0]
             along = cell[Cell.DIRECTION] * x + cell[Cell.DIRECTION + 1] * y + cell[Cell.DIRECTION + 2] * z
             of_mean = variance / m[0] + variance * (_FILLED * _FILLED * variance / (size * size)) ** 2
             along *= of_mean / (of_mean + max(cell[Cell.THICKNESS] - variance, 0.0))

@@ -186,8 +186,6 @@ class Adjusting:
         has_converged = abs(step[-1]) < _STEP_RAD and np.abs(twists[:, 3:]).max() < _TURN_RAD
         if not has_converged and abs(self.offset_rad) <= _LARGEST_RAD and self.steps < _STEPS:
             return None
-        poses, sigma_rad = (
-            self.last @ lie.between(self.poses[-1], self.poses),
-            math.sqrt(variance * inverse[-1, -1]),
-        )
+        poses = self.last @ lie.between(self.poses[-1], self.poses)
+        sigma_rad = math.sqrt(variance * inverse[-1, -1])
         return Adjustment(poses, self.offset_rad, sigma_rad)

@@ -163,10 +163,8 @@ def _twists(
     middles_m = [path_m[each.first + len(each.complete) // 2] for each in measured]
     rates = np.array([_rates(each, path_m) for each in measured])
     at_m, length_m = 0.5 * (path_m[first] + path_m[last]), path_m[last] - path_m[first]
-    twists, is_measured = (
-        np.empty((rates.shape[1], len(first), rates.shape[2])),
-        np.zeros(len(first), dtype=np.bool_),
-    )
+    twists = np.empty((rates.shape[1], len(first), rates.shape[2]))
+    is_measured = np.zeros(len(first), dtype=np.bool_)
     for group, component in np.ndindex(rates.shape[1:]):
         twists[group, :, component] = length_m * np.interp(at_m, middles_m, rates[:, group, component])
     for each in measured:

@@ -129,10 +129,8 @@ def draw_points(
     if not len(points):
         return
     colors = colors if len(colors) == 1 or np.ptp(points[:, 2]) else (GRAY,)
-    size_m, width = (
-        float(high[0] - low[0]),
-        float(np.clip(_STYLE.pixels_per_root * np.sqrt(len(points)), *_STYLE.widths)),
-    )
+    size_m = float(high[0] - low[0])
+    width = float(np.clip(_STYLE.pixels_per_root * np.sqrt(len(points)), *_STYLE.widths))
     edge_m = max(grain_m, size_m / _STYLE.widths[1]) if grain_m else size_m / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T

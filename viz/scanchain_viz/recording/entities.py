@@ -95,13 +95,11 @@ class Color:
     """Colors of the scenes, RGB."""
 
     YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
-    BLUE, GREEN, RED, ORANGE, VIOLET = (
-        (70, 150, 255),
-        (60, 200, 90),
-        (235, 70, 60),
-        (255, 140, 40),
-        (190, 120, 255),
-    )
+    BLUE = (70, 150, 255)
+    GREEN = (60, 200, 90)
+    RED = (235, 70, 60)
+    ORANGE = (255, 140, 40)
+    VIOLET = (190, 120, 255)
     CYAN, PALE_GREEN = (70, 210, 210), (190, 240, 160)
 
 
