@@ -16,13 +16,7 @@ from scanchain.config import LogConfig
 from scanchain.data import OtherPoints, Pose
 from scanchain.errors import InputError, counted, duration
 from scanchain.logs.index import Channel, Decoded, FileIndex, name_of
-from scanchain.logs.messages.lidar import (
-    Returns,
-    decode_cloud,
-    decode_laser_scan,
-    plane_height_m,
-    with_offsets,
-)
+from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m, with_offsets
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 from scanchain.logs.messages.readers import is_scan, reader
 from scanchain.logs.mounting import place_text, stated_poses

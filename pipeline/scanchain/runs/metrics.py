@@ -152,12 +152,7 @@ class Metrics(Struct, frozen=True):
 
 
 def measure(
-    results: Results,
-    expected: ExpectedError | None,
-    judged: Judged,
-    *,
-    run_s: float,
-    **of_run: Any,
+    results: Results, expected: ExpectedError | None, judged: Judged, *, run_s: float, **of_run: Any
 ) -> Metrics:
     """Metrics of a finished run; ``of_run`` are those that are neither of its scans nor of its results."""
     result, cloud, final, steps = results.result, results.cloud, results.final, results.result.steps

@@ -29,13 +29,7 @@ from scanchain.errors import InputError, ScanchainError, counted, one_line, reme
 from scanchain.files import without_keys, write_whole
 from scanchain.point_store import PointStore
 from scanchain.registration.matcher import CheckedMatcher, create_matcher
-from scanchain.runs.directory import (
-    CHECKPOINT_FILE,
-    POINTS_FILE,
-    RECORDING_FILE,
-    RUN_FILE,
-    RunDirectory,
-)
+from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE, RUN_FILE, RunDirectory
 from scanchain.runs.job import Recorder
 from scanchain.runs.opening import Opened
 from scanchain.runs.provenance import package_version

@@ -10,12 +10,7 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import orthonormalize, perturb
 from scanchain.kernels.matrices import factorize, substitute
 from scanchain.kernels.registration.association import associate, weigh
-from scanchain.kernels.registration.residuals import (
-    Problem,
-    gradients_by_group,
-    normal_equations,
-    robust_sums,
-)
+from scanchain.kernels.registration.residuals import Problem, gradients_by_group, normal_equations, robust_sums
 from scanchain.kernels.voxels import LINE, PLANE, POINT, Cell, move, shape_of
 
 CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
