@@ -31,8 +31,8 @@ from scanchain.registration.search import evenly
 from scanchain.runs.job import Progress
 from scanchain.settings import Override, load_settings
 
-_SCANS, _FEWEST = 16, 5  # scans of a window, and least number
-_SPACING, _DENSE = 0.9, 0.4  # distance of the scans of a window, in cells; with several lidars
+_SCANS = (5, 16)  # least and largest number of scans of a window
+_SPACING = (0.9, 0.4)  # distance of the scans of a window, in cells, and with several lidars
 _FINE = 0.5  # factor on the cells in which several lidars are compared: coarse ones hide that surfaces are curved
 _SIGNIFICANT = 2.0  # standard deviations of a value that is corrected
 _CONTRADICTED = 2.5  # standard deviations between level and upright planes above which a range offset is none
@@ -119,9 +119,9 @@ def calibrate(log: Log, config: Config, progress: Progress) -> Calibration:
         nothing = found.points[:0]
         bare = replace(scan, points=scan.points[:0], times_s=scan.times_s[:0], others=())
         tracked.append(msgspec.structs.replace(found, scan=bare, points=nothing, matched=nothing))
-    if len(tracked) < _FEWEST:
+    if len(tracked) < _SCANS[0]:
         raise InputError(
-            f"{log.name}: has {counted(len(tracked), 'scan')}; a calibration needs {_FEWEST} at least"
+            f"{log.name}: has {counted(len(tracked), 'scan')}; a calibration needs {_SCANS[0]} at least"
         )
     result, begin_ns = Calibration(), tracked[0].scan.stamp_ns
     motions = _motions(tracked)
@@ -169,7 +169,7 @@ class _Collector:
             return
         if not self.cell_m:
             self.cell_m = cell_of(tracked.points)
-        spacing = _DENSE if self.T_first_others else _SPACING
+        spacing = _SPACING[bool(self.T_first_others)]
         is_far = self.T_last is None or lie.apart(self.T_last, tracked.T_odom_lidar)[0] >= spacing * self.cell_m
         if not is_far and not (self.T_first_others and self.since >= 5):
             return  # with several lidars, standing scans are of use, too
@@ -179,7 +179,7 @@ class _Collector:
             return
         others = [self._points_of(scan, T_first_other) for T_first_other in self.T_first_others]
         self.collected[-1].append(_Taken(scan.index, evenly(tracked.points, POINTS), others))
-        if len(self.collected[-1]) == _SCANS:
+        if len(self.collected[-1]) == _SCANS[1]:
             self.left_out = 0
             self.collected.append([])
 
@@ -204,7 +204,7 @@ class _Collector:
         rates = np.concatenate([rates[:1], rates, rates[-1:]])
         found = list[Window]()
         for taken in self.collected:
-            if len(taken) >= _FEWEST:
+            if len(taken) >= _SCANS[0]:
                 numbers = np.array([each.number for each in taken])
                 others = [[each.others[o] for each in taken] for o in range(len(self.T_first_others))]
                 twists = np.stack([rates[numbers], rates[numbers + 1]], axis=1)

@@ -101,17 +101,17 @@ class VoxelSubmaps:
             last = -1
         submap = self.cached.pop((anchor, last), None)
         if submap is None:
-            chosen = self._nearest(keyframes[anchor]) if is_of_map else range(first, last + 1)
+            chosen: Sequence[int] = range(first, last + 1)
+            if is_of_map:
+                count = min(_OF_MAP * (2 * self.half_width + 1), self.of_map.n)
+                nearest = self.of_map.query(keyframes[anchor].T_odom_lidar[:-1, -1], count)[1]
+                chosen = sorted(np.atleast_1d(nearest).tolist())
             submap = self._build(keyframes[anchor], [keyframes[index] for index in chosen], is_of_map)
             submap.compact()
         self.cached[anchor, last] = submap
         if len(self.cached) > 64:
             self.cached.popitem(last=False)  # the least recently used one
         return submap
-
-    def _nearest(self, anchor: Keyframe) -> list[int]:
-        count = min(_OF_MAP * (2 * self.half_width + 1), self.of_map.n)
-        return sorted(np.atleast_1d(self.of_map.query(anchor.T_odom_lidar[:-1, -1], count)[1]).tolist())
 
     def _build(self, anchor: Keyframe, members: Sequence[Keyframe], is_of_map: bool) -> VoxelMap:
         """The submap; of a 3D map, of all points together: every voxel is fitted once, and all are equally old."""

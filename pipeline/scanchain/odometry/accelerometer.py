@@ -10,7 +10,7 @@ import numpy as np
 from scanchain.data import GRAVITY_M_S2, LEAST_FIT, Match, Matrix, Pose, RestForce, Vector, unit_of
 from scanchain.odometry.gyro import Gyro
 
-_FEWEST, _RECENT = 15, 20  # motions whose errors decide whether the accelerometer is used
+_MOTIONS = (15, 20)  # least and most whose errors decide whether the accelerometer is used
 _RATIO = (0.9, 1.5)  # of its squared errors to those of the last motion, below which it comes, and stays, in use
 _DETERMINED = 0.5  # least information of a match about the position, as a share of the largest of one direction
 _UNKNOWN_M_S = 1.0  # σ of the velocity above which it is not used
@@ -62,7 +62,9 @@ class Accelerometer:
         self.last_m, self.innovation = np.zeros(3), math.nan  # innovation of the last match; normalized
         self.last_C = np.zeros((3, 3))  # of the last match
         self.of_prediction = self.of_match = 1.0  # factors on variances
-        self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared, in σ²: ours, of the last motion
+        self.errors: deque[tuple[float, float]] = deque(
+            maxlen=_MOTIONS[1]
+        )  # squares, σ²: ours, of the last motion
         self.squares, self.compared = np.zeros(2), 0  # sums of all of them in m²
         self.scans, self.used = 0, 0
         self.unit_m_s2, self.defect = 1.0, ""
@@ -210,7 +212,7 @@ class Accelerometer:
         self.errors.append((float(ours @ weight @ ours), float(others @ weight @ others)))
         self.squares += ours @ ours, others @ others
         self.compared += 1
-        if len(self.errors) >= _FEWEST:
+        if len(self.errors) >= _MOTIONS[0]:
             of_ours, of_others = map(sum, zip(*self.errors, strict=True))
             self.is_trusted = of_ours < _RATIO[self.is_trusted] * of_others
 

@@ -16,7 +16,7 @@ from scanchain.kernels.scans import raise_elevation
 from scanchain.preprocess import Sweep
 from scanchain.registration.search import evenly
 
-_FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, their spacing in cells: first window, later ones
+_WINDOWS = ((14, 0.6), (16, 0.9))  # scans adjusted together, and their spacing in cells: the first time, later
 _RANGE_M, _SMALLEST_M = 14.0, 0.125  # median range at which cells are 1 m, and smallest cell
 POINTS = 3500  # largest number of points of each scan, evenly spread
 _STEPS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps; offset and turns of a converged one
@@ -84,7 +84,7 @@ class ElevationCalibration:
             return self._adopt(found) if found is not None else []
         if not self.is_wanted:
             return []
-        scans, spacing = _LATER if self.windows else _FIRST
+        scans, spacing = _WINDOWS[self.windows > 0]
         spacing_m = spacing * self.cell_m
         if self.T_odom_last is not None and lie.apart(self.T_odom_last, T_odom_lidar)[0] < spacing_m:
             return []

@@ -35,7 +35,10 @@ from scanchain.verdict import Judged, Verdict, merged
 LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path of a log below which not being found in the map proves nothing
 _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without a match with the map that is reported
-_MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # least reported difference of the live and the final pose of a scan
+_MOVED = (
+    0.3,
+    5.0,
+)  # m and standard deviations, least reported difference of the live and the final pose of a scan
 _PATHS = 12  # largest number of paths of the log that are searched for elsewhere in the end
 _APART_S = 1.0  # largest time between the first scan and the nearest pose of a file
 _AMBIGUOUS_SHARE = 0.5  # least share of ambiguous searches for which a log that is not found is called ambiguous
@@ -241,7 +244,7 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
     dimension = found.trajectory.dimension
     after = np.arange(len(found.states)) >= found.found_at
     away_m = np.linalg.norm((found.live - found.trajectory.poses)[:, :-1, -1], axis=1)
-    wrong = found.is_placed & (away_m > np.maximum(_MOVED_M, _MOVED_SIGMAS * found.sigma_m))
+    wrong = found.is_placed & (away_m > np.maximum(_MOVED[0], _MOVED[1] * found.sigma_m))
     kinds = (
         ("not joined to the map", ~found.is_placed, 0.0),
         ("lost", after & found.is_placed & (found.states == MapState.LOST), 0.0),

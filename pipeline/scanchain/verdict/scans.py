@@ -22,7 +22,7 @@ _PASSED_M = (1.0, 4.0)
 _MEDIAN_SCANS = 9  # window of the median of ``fit``; moving people contradict single scans
 
 _LEAST_OVERLAP = 2.0 / 3.0  # smallest accepted ratio of the inlier share to the usual one
-_FEWEST, _BEFORE = 3, 10  # least and largest number of previous scans whose median is the usual share
+_PREVIOUS = (3, 10)  # least and largest number of previous scans whose median is the usual share
 
 _ACCELERATION = (4.0, 12.0)  # m/s² and rad/s², σ: a fifth to a third of what vehicles and hands reach
 _MOTION = (0.05, 0.01)  # m and rad, σ of the motion between two scans by scan matching
@@ -139,8 +139,9 @@ def check_overlap(inlier_share: Floats) -> Floats:
     usual = np.full(len(inlier_share), np.nan)
     if not np.isfinite(inlier_share).any():
         return usual
-    padded = np.append(np.full(_BEFORE, np.nan), inlier_share)  # the first scans have fewer previous ones
-    usual[_FEWEST:] = np.nanmedian(sliding_window_view(padded, _BEFORE)[_FEWEST:-1], axis=1)
+    fewest, most = _PREVIOUS
+    padded = np.append(np.full(most, np.nan), inlier_share)  # the first scans have fewer previous ones
+    usual[fewest:] = np.nanmedian(sliding_window_view(padded, most)[fewest:-1], axis=1)
     return inlier_share / np.maximum(usual, 1e-3)
 
 

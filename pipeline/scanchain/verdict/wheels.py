@@ -31,7 +31,7 @@ _MEDIAN_LIMIT = 2.0  # largest median innovation; about 1 where calibration and 
 _LEAST_TURN_RAD = 1.0  # rotation of the wheels over a log below which its direction is not compared
 _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
 
-_FEWEST, _MOST = 3, 20  # least and largest number of closures around a segment that decide; the shortest are used
+_CLOSURES = (3, 20)  # least and largest number of those around a segment that decide; the shortest are used
 _MOST_PARTS = 8  # largest number of segments within a closure; one with more is not used
 _RATIO = 1.0 / 3.0  # largest ratio of the residual with the right source to that with the wrong one
 # least share of a disagreement that the wrong source leaves, that a jump of the wheels explains, or, of one with
@@ -280,7 +280,7 @@ def which_slipped(
             found.append((Kind.WHEELS_SLIP, size_m))
             continue
         around = np.flatnonzero(closures.is_accepted & (low <= first) & (high >= last))
-        around = around[np.argsort(high[around] - low[around], kind="stable")][:_MOST]
+        around = around[np.argsort(high[around] - low[around], kind="stable")][: _CLOSURES[1]]
         left = []
         for closure in around.tolist():
             within = np.flatnonzero((ends[:, 0] >= low[closure]) & (ends[:, 1] <= high[closure]))
@@ -304,7 +304,7 @@ def _left_m(off: Floats, apart: Floats, is_this: Floats) -> tuple[float, float]:
 
 def _decided(left_m: Floats, size_m: float) -> Kind:
     """Kind of slip from residuals (C, 2, 2) of closures: rest by scans or wheels, part by scans or wheels."""
-    if len(left_m) < _FEWEST:
+    if len(left_m) < _CLOSURES[0]:
         return Kind.WHEELS
     by_scans, by_wheels = np.median(left_m, axis=0).T
     for right, wrong, slipped in ((by_scans, by_wheels, Kind.WHEELS_SLIP), (by_wheels, by_scans, Kind.SCANS_SLIP)):

@@ -36,7 +36,7 @@ _CORE = 0.7  # share of correct times assumed in a scan: the span of its densest
 _SAMPLE = np.sort(np.random.default_rng(0).random(512))  # positions, 0 to 1, of the times that are sampled
 
 # comparison with the neighboring scans and the period; chosen with the drivers of tests/logs/test_point_times.py
-_BEFORE, _AFTER = 12, 3  # number of neighbors before and after a scan
+_NEIGHBORS = (12, 3)  # number of them before and after a scan
 _SHORT, _LONG = 0.9, 1.2  # limits of a span as a share of the usual span or of the period
 _DENSE = 0.85  # smallest share of the core in the span of a sweep without outliers
 _LONGEST, _MOST_PERIODS = 2.5, 10.0  # longest sweep without outliers in usual spans, and any sweep in periods
@@ -214,7 +214,7 @@ class PointTimes:
 
     def checked(self, messages: Iterable[Decoded], topic: str, *, most_ns: float = inf) -> Iterator[Decoded]:
         """Messages in their order, the scans of the topic with checked times, held back by ``most_ns`` at most."""
-        waiting, before, ahead = deque[Decoded](), deque[Returns](maxlen=_BEFORE), deque[Returns]()
+        waiting, before, ahead = deque[Decoded](), deque[Returns](maxlen=_NEIGHBORS[0]), deque[Returns]()
         for message in chain(messages, [None]):
             if message is not None:
                 waiting.append(message)
@@ -222,7 +222,7 @@ class PointTimes:
                     ahead.append(message.value)
             while waiting and (
                 message is None
-                or len(ahead) > _AFTER
+                or len(ahead) > _NEIGHBORS[1]
                 or not ahead
                 or waiting[0].value is not ahead[0]
                 or message.log_time_ns - waiting[0].log_time_ns > most_ns
