@@ -62,9 +62,7 @@ class Accelerometer:
         self.last_m, self.innovation = np.zeros(3), math.nan  # innovation of the last match; normalized
         self.last_C = np.zeros((3, 3))  # of the last match
         self.of_prediction = self.of_match = 1.0  # factors on variances
-        self.errors: deque[tuple[float, float]] = deque(
-            maxlen=_MOTIONS[1]
-        )  # squares, σ²: ours, of the last motion
+        self.errors: deque[tuple[float, float]] = deque(maxlen=_MOTIONS[1])  # ours and the last motion's, σ²
         self.squares, self.compared = np.zeros(2), 0  # sums of all of them in m²
         self.scans, self.used = 0, 0
         self.unit_m_s2, self.defect = 1.0, ""

@@ -35,10 +35,7 @@ from scanchain.verdict import Judged, Verdict, merged
 LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path of a log below which not being found in the map proves nothing
 _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without a match with the map that is reported
-_MOVED = (
-    0.3,
-    5.0,
-)  # m and standard deviations, least reported difference of the live and the final pose of a scan
+_MOVED = (0.3, 5.0)  # m and σ, least reported difference of the live and the final pose of a scan
 _PATHS = 12  # largest number of paths of the log that are searched for elsewhere in the end
 _APART_S = 1.0  # largest time between the first scan and the nearest pose of a file
 _AMBIGUOUS_SHARE = 0.5  # least share of ambiguous searches for which a log that is not found is called ambiguous
