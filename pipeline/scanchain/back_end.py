@@ -52,7 +52,10 @@ class BackEnd:
         prior_is_final: bool = True,
         is_live: bool = False,
     ) -> None:
-        """Begin without keyframes; arguments as in ``Slam``."""
+        """Begin without keyframes; arguments as in ``Slam``.
+
+        prior_is_final : whether the poses of the map are final; else scans are matched to keyframes of one pass
+        """
         self.config, self.is_live = config, is_live
         self.keyframes: list[Keyframe] = []
         self.errors: list[KeyframeErrors] = []

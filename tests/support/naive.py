@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.kernels import voxels
-from scanchain.kernels.registration.icp import CONVERGED, align, problem_of
+from scanchain.kernels.registration.icp import Ending, align, problem_of
 
 
 def voxel_of(point, size):
@@ -304,5 +304,5 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         scan = points[first:last]
         problem = problem_of(voxels, scan, T, prior, settings)
         fit = align(problem, T, np.zeros(len(prior)), settings.first_scale_m)
-        if fit.ending == CONVERGED and fit.pairs >= least_share * (last - first):
+        if fit.ending == Ending.CONVERGED and fit.pairs >= least_share * (last - first):
             poses[k] = T

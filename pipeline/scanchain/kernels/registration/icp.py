@@ -13,13 +13,17 @@ from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.residuals import Problem, gradients_by_group, normal_equations, robust_sums
 from scanchain.kernels.voxels import LINE, PLANE, POINT, Cell, move, shape_of
 
-CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
-
 SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
 SLACK = 0.02  # voxels that points may move before they are re-associated
 PATIENCE = 20  # steps at the final scale, after which correspondences are fixed
 _DAMPING = (1e-9, 1e8)  # least and most
 _SECTORS = 8  # of a scan
+
+
+class Ending(IntEnum):
+    """Why the iterations ended."""
+
+    CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
 
 
 class Sums(IntEnum):
@@ -54,7 +58,7 @@ class Fit(NamedTuple):
         without a shape would constrain a pose in every direction, whether the surface does or not
     cost : robust cost in m², with the limit ½s² for every point without a correspondence
     total_weight, squares : Σ w and Σ w r² (m²)
-    pairs, iterations, ending : correspondences, linearizations, one of the codes above
+    pairs, iterations, ending : correspondences, linearizations, an ``Ending``
     """
 
     H: NDArray[np.float64]
@@ -95,14 +99,14 @@ def align(problem, T, offset, first_scale_m: float):
     now.sums[Sums.DAMPING] = 1e-4
     scale_m, last_scale_m, steps_at_last = first_scale_m, 0.0, 0
     moved_m = np.inf
-    pairs, iterations, ending = 0, 0, OUT_OF_ITERATIONS
+    pairs, iterations, ending = 0, 0, Ending.OUT_OF_ITERATIONS.value
     while iterations < settings.max_iterations:
         iterations += 1
         if steps_at_last < PATIENCE and moved_m > SLACK * size_m:
             moved_m = 0.0
             pairs = correspond(problem, T, settings.reach, settings.max_distance_m)
             if pairs == 0:
-                ending = NO_CORRESPONDENCES
+                ending = Ending.NO_CORRESPONDENCES.value
                 break
         if moved_m == 0.0 or scale_m != last_scale_m:
             _linearize(problem, scale_m, now)
@@ -110,11 +114,11 @@ def align(problem, T, offset, first_scale_m: float):
         if scale_m <= settings.scale_m:
             slack_m = SLACK * size_m - moved_m if steps_at_last + 1 < PATIENCE else np.inf
         if not _descend(problem, scale_m, slack_m, now, trial, x, factor):
-            ending = SINGULAR
+            ending = Ending.SINGULAR.value
             break
         if scale_m <= settings.scale_m:
             if _is_small(x, settings):
-                ending = CONVERGED
+                ending = Ending.CONVERGED.value
                 break
             steps_at_last += 1
         moved_m += _largest_move(x, problem.range_m)
@@ -227,7 +231,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         T = poses[k].copy()
         problem = problem_of(voxels, scan, T, prior, settings)
         fit = align(problem, T, offset, settings.first_scale_m)
-        if fit.ending == CONVERGED and fit.pairs >= least_share * scan.shape[0]:
+        if fit.ending == Ending.CONVERGED and fit.pairs >= least_share * scan.shape[0]:
             _copy(T, poses[k])
 
 

@@ -6,7 +6,6 @@ direction and lane.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
 from typing import NamedTuple
@@ -88,25 +87,22 @@ ROUNDS_ROUTE = np.array([
 ])  # fmt: skip
 
 
-def town(
-    rng: np.random.Generator,
-    parked: float = 0.55,
-    *,
-    streets_x_m: Sequence[float] = (-50.0, 0.0, 50.0, 100.0, 150.0),
-    streets_y_m: Sequence[float] = (-40.0, 0.0, 40.0, 80.0),
-) -> Solids:
+def town(rng: np.random.Generator, parked: float = 0.55) -> Solids:
     """The town; streets and blocks are fixed, everything else is sampled from ``rng``.
 
     parked : share of the parking spaces at the curb that are occupied
-    streets_x_m, streets_y_m : middles of the streets that run north, and east
     """
+    north_m, east_m = (
+        (-50.0, 0.0, 50.0, 100.0, 150.0),
+        (-40.0, 0.0, 40.0, 80.0),
+    )  # middles of streets, by direction
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)  # of waves of 0.5 m: slopes of 3 % at most
     scenery = Scenery(np.array([0.0, 0.5, 2.0 * np.pi / 140.0, phase_x, 0.5, 2.0 * np.pi / 110.0, phase_y]))
-    for (west, east), (south, north) in product(pairwise(streets_x_m), pairwise(streets_y_m)):
+    for (west, east), (south, north) in product(pairwise(north_m), pairwise(east_m)):
         _block(scenery, west, east, south, north, rng)
-    for y, (west, east) in product(streets_y_m, pairwise(streets_x_m)):
+    for y, (west, east) in product(east_m, pairwise(north_m)):
         _street(scenery, np.array([west, y]), np.array([east, y]), parked, rng)
-    for x, (south, north) in product(streets_x_m, pairwise(streets_y_m)):
+    for x, (south, north) in product(north_m, pairwise(east_m)):
         _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
 
