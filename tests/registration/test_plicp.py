@@ -67,7 +67,8 @@ def result(**changes):
     """A result without fault for 1000 points, but for these changes."""
     sound = Result(
         T=np.eye(3), information=np.eye(3), direction=np.eye(3)[0], eigenvalue=0.5, signal=9.0, fit=0.9,
-        range_m=9.0, residual_m=0.1, cost=1.0, pairs=990, on_surfaces=900, iterations=4, ending=icp.Ending.CONVERGED,
+        range_m=9.0, residual_m=0.1, cost=1.0, pairs=990, on_surfaces=900, iterations=4,
+        ending=icp.Ending.CONVERGED,
         variance_factor=1.0, systematic=np.zeros((3, 3)),
     )  # fmt: skip
     return sound._replace(**changes)

@@ -24,7 +24,7 @@ _LEAST_OVERLAP = 0.75  # least share of points with a correspondence; correct po
 _REDUNDANCY = 10  # correspondences on surfaces per degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
 _KERNEL_SIGMAS = 4.0  # least kernel scale, in standard deviations of a range
-_ENDINGS = {
+_ENDINGS: dict[int, str] = {
     icp.Ending.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.Ending.NO_CORRESPONDENCES: "no point has a correspondence in the map",
     icp.Ending.SINGULAR: "the correspondences do not determine the pose",
