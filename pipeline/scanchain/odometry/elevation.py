@@ -139,7 +139,7 @@ def raised(points: Points, offset_rad: float) -> Points:
 
 
 def cell_of(points: Points) -> float:
-    """Edge of the cells in which planes are sought, in m: small in narrow surroundings.
+    """Edge in m of the cells that are searched for planes: small in narrow surroundings.
 
     points : (N, 3) of a scan
     """
