@@ -169,11 +169,8 @@ def _voxel_at(voxels, key: int, tick: int) -> int:
     voxels.keys[voxel] = key
     voxels.moments[voxel].fill(0.0)
     voxels.cells[voxel].fill(0.0)
-    (
-        voxels.history[voxel, History.BORN],
-        voxels.history[voxel, History.SEEN],
-        voxels.history[voxel, History.FITTED],
-    ) = tick, -1, 0
+    history = voxels.history[voxel]
+    history[History.BORN], history[History.SEEN], history[History.FITTED] = tick, -1, 0
     return voxel
 
 

@@ -92,10 +92,8 @@ def town(rng: np.random.Generator, parked: float = 0.55) -> Solids:
 
     parked : share of the parking spaces at the curb that are occupied
     """
-    north_m, east_m = (
-        (-50.0, 0.0, 50.0, 100.0, 150.0),
-        (-40.0, 0.0, 40.0, 80.0),
-    )  # middles of streets, by direction
+    north_m = (-50.0, 0.0, 50.0, 100.0, 150.0)  # x of the streets that run north
+    east_m = (-40.0, 0.0, 40.0, 80.0)  # y of those that run east
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)  # of waves of 0.5 m: slopes of 3 % at most
     scenery = Scenery(np.array([0.0, 0.5, 2.0 * np.pi / 140.0, phase_x, 0.5, 2.0 * np.pi / 110.0, phase_y]))
     for (west, east), (south, north) in product(pairwise(north_m), pairwise(east_m)):
