@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from scanchain.comparison.overall import Overall
 
 Varied = Mapping[str, Mapping[str, "Overall"]]  # by key and value of --vary
-_DAY_S = 86_400.0  # time limit of a log where none is given
 
 
 def _variations(_: object, __: object, words: Sequence[str]) -> list[tuple[str, list[str]]]:
@@ -120,7 +119,7 @@ def batch(
         overrides=overrides,
         arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in overrides)),
         workers=workers or os.cpu_count() or 1,
-        time_s=time_s or _DAY_S,
+        time_s=time_s or 86_400.0,
         **limits,
     )
     from scanchain_viz.report.batch import write_batch_report
