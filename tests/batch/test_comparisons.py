@@ -255,6 +255,7 @@ def test_a_setting_is_varied_for_the_methods_that_have_it(logs, tmp_path, settin
             ["--vary", "max_iterations=5"],
             "--vary max_iterations: there are several, matching.max_iterations and graph",
         ),
+        (["--vary", "loops.enabled=true"], "--vary loops.enabled distinguishes plicp, svd, +loops and +imu"),
         (["--vary", "every=0"], "--vary every: log.every is 0; it must be a whole number >= 1"),
     ],
 )

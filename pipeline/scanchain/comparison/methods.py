@@ -124,12 +124,13 @@ def resolve(
         )
     if len(set(names)) < len(names):
         raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --config instead")
+    overrides = (*overrides, *(variation.overrides if variation else ()))
     for override in overrides:
         if override.key in _KINDS:
             raise InputError(
                 f"{override.flag} distinguishes plicp, svd, +loops and +imu; choose by --methods or --matcher"
             )
-    ours = (shared_settings(file), (*overrides, *(variation.overrides if variation else ())))
+    ours = (shared_settings(file), overrides)
     methods = [_method(name, tables.get(name, {}), dimension, f"{file}: [{name}]", *ours) for name in names]
     varied = methods if variation is None else [variation.of(method, dimension) for method in methods]
     if variation is not None and not any(varied):
