@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import shlex
 import subprocess
 from pathlib import Path
@@ -28,6 +27,8 @@ def run_program(command: str, scans: StoredScans, folder: Path) -> tuple[Matrix,
 
     Raises InputError for a command that fails or does not write a pose for each scan.
     """
+    import resource  # of POSIX only
+
     clouds, poses = folder / "clouds", folder / "poses.tum"
     clouds.mkdir()
     for scan in scans.scans():
