@@ -425,6 +425,29 @@ def test_bearings_and_ranges_are_edges_to_points_that_begin_where_they_are_seen(
     assert np.allclose(file.graph.information[0], np.eye(3))  # TORO's order, no covariance
 
 
+@pytest.mark.parametrize(
+    ("name", "order", "poses", "points"),
+    [
+        ("w100_30.g2o", "AUTO", 30, 0),
+        ("w100.graph", "TORO", 100, 0),
+        ("example.graph", "AUTO", 95, 24),
+        ("victoria_park.txt", "AUTO", 6969, 151),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_edges_of_the_files_that_gtsam_brings_are_those_that_it_reads(name, order, poses, points):
+    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed")
+    path, form = gtsam.findExampleDataFile(name), getattr(gtsam.NoiseFormat, f"NoiseFormat{order}")
+    theirs = gtsam.load2D(path, None, 0, False, True, form)[0]
+    theirs = [theirs.at(k) for k in range(theirs.size()) if isinstance(theirs.at(k), gtsam.BetweenFactorPose2)]
+    roots = np.array([factor.noiseModel().R() for factor in theirs])
+    ours = read_g2o(path)
+    is_point = ours.graph.is_point[ours.graph.edges[:, 1]]
+    assert ours.ids[ours.graph.edges[~is_point]].tolist() == [list(factor.keys()) for factor in theirs]
+    assert np.allclose(ours.graph.information[~is_point], np.swapaxes(roots, 1, 2) @ roots, rtol=1e-9)
+    assert np.bincount(ours.graph.is_point, minlength=2).tolist() == [poses, points]
+
+
 def test_landmarks_may_have_the_ids_of_poses(read):
     file = read("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nLANDMARK2 0 1 2 0 1 0 1\nLANDMARK2 1 1 1 0 1 0 1\n")
     assert file.ids.tolist() == [0, 1, 2] and file.graph.is_point.tolist() == [False, False, True]
@@ -532,12 +555,12 @@ def test_quaternions_that_are_not_of_unit_length_are_normalized_and_said(read):
             ":2: vertex 1 is not .*, or remove all VERTEX lines to start from odometry",
         ),
         (triangle(2**63), f":1: EDGE_SE2: vertex id '{2**63}' is not a 64-bit integer"),
-        (PLAIN + "EDGE2 1 2 1 0 0\n", ":4: EDGE2 has 5 values, needs 11"),
+        (PLAIN + "EDGE2 1 2 1 0 0\n", ":4: EDGE2 has 5 values, needs 11; it has no information"),
         ("ODOMETRY 0 1 1 0 0 0 0 0 1 0 1\n", ":1: covariance is not positive definite; .*--noise"),
         ("ODOMETRY 0 1 1 0 0 1 2 0 1 0 1\n", ":1: covariance is not positive definite"),
         (PLAIN + "LANDMARK 1 9 1 0 1 1 1\n", ":4: covariance is not positive definite"),
         (PLAIN + "BR 1 9 1 2 0 0.1\n", ":4: covariance is not positive definite"),
-        (PLAIN + "BR 1 9 1 2 0.1\n", ":4: BR has 5 values, needs 6"),
+        (PLAIN + "BR 1 9 1 2 0.1\n", ":4: BR has 5 values, needs 6$"),
         (PLAIN + "EDGE_SE2 0 2 1 0 0 -4 0 0 5 0 6\n", ":4: information matrix of edge 0-2 is not positive semi"),
     ],
 )

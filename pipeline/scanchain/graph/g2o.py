@@ -47,6 +47,7 @@ ROTATION_COMMENT: dict[Rotation, str] = {
     "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
     "quaternion": "# information of EDGE_SE3:QUAT is of (translation, vector part of unit quaternion), as g2o",
 }
+_TRIANGLES = (3, 6, 21)  # numbers of entries of the information of edges to points, in the plane, and in space
 _LIBRSF = {"odom2", "odom2diff", "odom3", "range2", "range3", "point2", "point3", "loop"}
 
 
@@ -250,7 +251,7 @@ class Lines:
         try:
             return self.path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not text"
+            reason = getattr(error, "strerror", None) or "not UTF-8 text"
             raise InputError(
                 f"{self.path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
             ) from error
@@ -263,7 +264,8 @@ class Lines:
         self.dimension = tag.dimension
         if len(words) != 1 + tag.ids + len(tag.columns):
             count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
-            raise self.error(line, f"{name} has {count}, needs {wanted}")
+            is_bare = tag.ids == 2 and wanted - len(words) + 1 in _TRIANGLES
+            raise self.error(line, f"{name} has {count}, needs {wanted}{'; it has no information' * is_bare}")
         ids = [self._vertex_id(line, name, word) for word in words[1 : 1 + tag.ids]]
         try:
             numbers = list(map(float, words[1 + tag.ids :]))
@@ -574,7 +576,8 @@ def _information(lines: Lines, *, is_quaternion: bool) -> Matrix:
             raise lines.error(
                 line, "covariance is not positive definite; correct it, or say with --noise what it is"
             )
-        information[chosen, :m, :m] = np.linalg.inv(C)
+        inverse = np.linalg.inv(C)
+        information[chosen, :m, :m] = 0.5 * (inverse + np.swapaxes(inverse, 1, 2))
     if noise == "square-root":
         information = squared(information)
     elif noise == "auto" and is_covariance.any():
