@@ -31,7 +31,6 @@ from scanchain.threads import threads
 
 TABLE = Path(compiling.__file__).with_name("signatures.json")
 KINDS = "2d", "3d", "rest"  # kernels needed by 2D runs, by 3D runs, and by everything else
-_MOST = 8  # largest useful number of processes: the longest chain of calls takes an eighth of the total time
 
 
 class Signature(NamedTuple):
@@ -56,7 +55,8 @@ def compile_ahead(kinds: Sequence[str], count: Callable[[int, int], None]) -> bo
     if not missing:
         return True
     with standing_still():
-        is_whole = _compile_all(missing, min(threads(), _MOST), count)
+        # the longest chain of calls takes an eighth of the total time
+        is_whole = _compile_all(missing, min(threads(), 8), count)
     with suppress(OSError):
         for kind in missing if is_whole else ():
             marks[kind].touch()

@@ -52,7 +52,10 @@ class BackEnd:
         prior_is_final: bool = True,
         is_live: bool = False,
     ) -> None:
-        """Begin without keyframes; arguments as in ``Slam``."""
+        """Begin without keyframes; arguments as in ``Slam``.
+
+        prior_is_final : whether the poses of the map are final; else scans are matched to keyframes of one pass
+        """
         self.config, self.is_live = config, is_live
         self.keyframes: list[Keyframe] = []
         self.errors: list[KeyframeErrors] = []
@@ -101,17 +104,15 @@ class BackEnd:
             self.graph.add_pose(self.placement.predict(T_odom_last, T_odom_lidar), keyframe.stamp_ns)
             if number == self.first:
                 starts_segment, errors = True, errors._replace(renewal=1.0)
-                constraints = [self._unknown_start(lie.between(T_odom_last, T_odom_lidar)), *constraints]
+                # almost no information, so that the graph is connected
+                information = edge_information(self.nothing, LARGEST_SIGMAS[0], np.pi)
+                Z = lie.between(T_odom_last, T_odom_lidar)
+                constraints = [Constraint(Odometry(), self.first - 1, Z, information), *constraints]
         self.errors.append(errors)
         if starts_segment:
             self.placement.start_segment(number)
         for factor, i, Z, information in constraints:
             self.graph.add_factor(factor, number, information, Z, i)
-
-    def _unknown_start(self, Z: Pose) -> Constraint:
-        """Constraint that ties the first keyframe after those of a map to them, so that the graph is connected."""
-        information = edge_information(self.nothing, LARGEST_SIGMAS[0], np.pi)
-        return Constraint(Odometry(), self.first - 1, Z, information)
 
     def replace_points(self, number: int, stored: KeyframePoints) -> None:
         """Replace the points of a keyframe, which were deskewed again."""

@@ -400,16 +400,20 @@ _REGISTRATIONS: dict[Residual, tuple[str, str]] = {
 
 
 class Open3dSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Voxels for downsampling, largest distance of correspondences, and neighborhood of normals."""
+    """Voxels for downsampling, largest distance of correspondences, and neighborhood of normals.
+
+    scales : multiples of voxels and distance at which scans are registered, one after the other
+    """
 
     voxel_size_m: Positive = 0.5
     max_distance_m: Positive = 1.0
     normal_radius_m: Positive = 1.5
     normal_neighbors: Count = 20
     max_iterations: Count = 30
+    scales: Annotated[tuple[Positive, ...], Meta(min_length=1)] = (1.0,)
 
 
-OPEN3D = Open3dSettings()
+OPEN3D, MULTISCALE = Open3dSettings(), Open3dSettings(scales=(4.0, 2.0, 1.0))
 PLANAR_OPEN3D = Open3dSettings(voxel_size_m=0.05, max_distance_m=0.5, normal_radius_m=0.5)
 
 
@@ -425,24 +429,29 @@ class Open3dPairs(_Chained):
         register, estimation = _REGISTRATIONS[residual]
         self.register, self.estimation = getattr(registration, register), getattr(registration, estimation)()
         self.criteria: Any = registration.ICPConvergenceCriteria(max_iteration=settings.max_iterations)
+        scales = ", ".join(f"{scale:g}" for scale in settings.scales)
         self.description = (
             f"Open3D {register}, {residual}, scan to scan, voxels of {settings.voxel_size_m:g} m, correspondences "
-            f"within {settings.max_distance_m:g} m, {settings.max_iterations} iterations, constant velocity, no "
-            "deskewing"
+            f"within {settings.max_distance_m:g} m{f', both times {scales}' if len(settings.scales) > 1 else ''}, "
+            f"{settings.max_iterations} iterations, constant velocity, no deskewing"
         )
 
     def _registered(self, cloud: Any) -> Pose:
-        distance_m, guess = self.settings.max_distance_m, self.T_previous_current
-        result = self.register(cloud, self.previous, distance_m, guess, self.estimation, self.criteria)
-        return np.array(result.transformation)
+        T = self.T_previous_current
+        for scale, source, target in zip(self.settings.scales, cloud, self.previous, strict=True):
+            distance_m = scale * self.settings.max_distance_m
+            T = self.register(source, target, distance_m, T, self.estimation, self.criteria).transformation
+        return np.array(T)
 
     def _prepared(self, points: NDArray[np.float64]) -> Any:
-        cloud = self.open3d.geometry.PointCloud(self.open3d.utility.Vector3dVector(points))
-        cloud = cloud.voxel_down_sample(self.settings.voxel_size_m)
-        if self.residual != "point-to-point":
-            radius_m, neighbors = self.settings.normal_radius_m, self.settings.normal_neighbors
-            cloud.estimate_normals(self.open3d.geometry.KDTreeSearchParamHybrid(radius_m, neighbors))
-        return cloud
+        """A cloud for each scale."""
+        whole = self.open3d.geometry.PointCloud(self.open3d.utility.Vector3dVector(points))
+        clouds = [whole.voxel_down_sample(scale * self.settings.voxel_size_m) for scale in self.settings.scales]
+        for scale, cloud in zip(self.settings.scales, clouds, strict=True):
+            if self.residual != "point-to-point":
+                radius_m, neighbors = scale * self.settings.normal_radius_m, self.settings.normal_neighbors
+                cloud.estimate_normals(self.open3d.geometry.KDTreeSearchParamHybrid(radius_m, neighbors))
+        return clouds
 
 
 def _import_open3d() -> Any:
@@ -484,6 +493,7 @@ class Entry:
 BASELINES: dict[str, Entry] = {
     "open3d-p2p": Entry(partial(Open3dPairs, "point-to-point"), "open3d", OPEN3D, PLANAR_OPEN3D),
     "open3d-p2l": Entry(partial(Open3dPairs, "point-to-plane"), "open3d", OPEN3D, None),
+    "open3d-multiscale": Entry(partial(Open3dPairs, "point-to-plane"), "open3d", MULTISCALE, None),
     "open3d-gicp": Entry(partial(Open3dPairs, "plane-to-plane"), "open3d", OPEN3D, PLANAR_OPEN3D, is_raised=True),
     "kiss-icp": Entry(KissIcp, "kiss-icp", KISS, PLANAR_KISS),
     "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),

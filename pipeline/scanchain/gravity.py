@@ -7,18 +7,17 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import gammaincinv
 
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import GRAVITY_M_S2, Integers, Matrix, RestForce, Vector
 from scanchain.graph.consistency import is_bent
 from scanchain.graph.factors import Prior
+from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
 
-_CORRELATED_S, _LEAST_S = 1.0, 0.01  # time constant of the errors, and least time between keyframes
-_SURE = 0.999  # probability that errors as stated pass the test
-_HELD_M, _HELD_RAD = 1e-4, 1e-5  # σ of position and heading of the first pose, which gravity and ground leave free
+_CORRELATED_S = 1.0  # time constant of the errors
+_HELD = (1e-4, 1e-5)  # m and rad, σ of the first pose, whose position and heading gravity and ground leave free
 
 
 def upright(up: Vector) -> Matrix:
@@ -30,8 +29,8 @@ def hold_first(graph: PoseGraph, up: Vector, *, height: bool) -> None:
     """Add a prior of the first pose: heading about ``up`` (3,), position along the ground, and ``height``."""
     normal, information = graph.poses[0, :3, :3].T @ up, np.zeros((6, 6))
     across = np.outer(normal, normal)
-    information[:3, :3] = (np.eye(3) if height else np.eye(3) - across) * _HELD_M**-2.0
-    information[3:, 3:] = across * _HELD_RAD**-2.0
+    information[:3, :3] = (np.eye(3) if height else np.eye(3) - across) * _HELD[0] ** -2.0
+    information[3:, 3:] = across * _HELD[1] ** -2.0
     graph.add_factor(Prior(), 0, information, graph.poses[0])
 
 
@@ -48,7 +47,7 @@ def leveled(graph: PoseGraph, forces: Mapping[int, RestForce], config: GraphConf
     best = min(forces.values(), key=lambda each: float(np.trace(each.bias_covariance)))
     ups = np.array([forces[k].force for k in chosen]) - best.bias
     ups /= np.linalg.norm(ups, axis=1, keepdims=True)
-    spacing_s = max(1e-9 * float(np.ptp(graph.stamps_ns[chosen])) / len(chosen), _LEAST_S)
+    spacing_s = max(1e-9 * float(np.ptp(graph.stamps_ns[chosen])) / len(chosen), 0.01)
     independent = math.tanh(0.5 * spacing_s / _CORRELATED_S)  # share of them
     sigma_rad = np.array([_tilt_sigma(up, forces[k].covariance) for k, up in zip(chosen, ups, strict=True)])
     sigma_rad /= math.sqrt(independent)
@@ -59,7 +58,7 @@ def leveled(graph: PoseGraph, forces: Mapping[int, RestForce], config: GraphConf
     result.move(0, T_level)
     note = f"IMU: its accelerometer levels the result to {math.degrees(known_rad):.1g}°"
     tilts_rad = np.linalg.norm(np.einsum("nij,nj->ni", result.poses[chosen, :2, :3], ups), axis=1)
-    if np.sum((tilts_rad / sigma_rad) ** 2) < 2.0 * gammaincinv(len(chosen), _SURE):
+    if np.sum((tilts_rad / sigma_rad) ** 2) < rejection_limit(0.0, 2 * len(chosen)):
         return result, note
     corrected = result.copy()
     _constrain(corrected, chosen, ups, sigma_rad)

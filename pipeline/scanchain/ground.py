@@ -16,7 +16,7 @@ from scanchain.graph.factors import Prior
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.gravity import hold_first, upright
 
-_UNEVEN_M, _UNEVEN_RAD = 0.02, 0.01  # largest σ of height and tilt in a plane, by the ground and the suspension
+_UNEVEN = (0.02, 0.01)  # m and rad, largest σ of height and tilt in a plane, by the ground and the suspension
 _CORRELATED = 4  # number of successive keyframes that share such an error
 _MOUNTED_RAD = 0.05  # σ of the mounting of the lidar
 _PART_M = 50.0  # least length of the parts of the path that are tested, of which a plane has at least two
@@ -113,7 +113,7 @@ class _Test:
         part, poses = self.graph.in_force(first, last), self.graph.poses[first:last]
         T_world_plane, up = _fitted(poses, self.up)
         away_m = (poses[:, :3, 3] - T_world_plane[:3, 3]) @ T_world_plane[:3, 2]
-        if np.abs(away_m).max() > 3.0 * _UNEVEN_M + self.drift * parts * _PART_M:
+        if np.abs(away_m).max() > 3.0 * _UNEVEN[0] + self.drift * parts * _PART_M:
             return None
         free = part.optimize(GraphConfig(), initialize="given")
         _constrain(part, np.arange(len(part)), T_world_plane, up)
@@ -131,7 +131,7 @@ def _fitted(poses: Matrix, up: Vector) -> tuple[Pose, Vector]:
     T, mean = np.eye(4), (poses[:, :3, :3] @ up).mean(axis=0)
     T[:3, 3], R = poses[:, :3, 3].mean(axis=0), upright(mean / np.linalg.norm(mean))
     away = (poses[:, :3, 3] - T[:3, 3]) @ R.T
-    H = away[:, :2].T @ away[:, :2] + np.eye(2) * (_UNEVEN_M / _MOUNTED_RAD) ** 2
+    H = away[:, :2].T @ away[:, :2] + np.eye(2) * (_UNEVEN[0] / _MOUNTED_RAD) ** 2
     normal = R.T @ np.append(-np.linalg.solve(H, away[:, :2].T @ away[:, 2]), 1.0)
     T[:3, :3] = upright(normal / np.linalg.norm(normal)).T
     up = np.einsum("nji,j->i", poses[:, :3, :3], T[:3, 2])
@@ -143,7 +143,7 @@ def _constrain(graph: PoseGraph, chosen: Integers, T_world_plane: Pose, up: Vect
     if not graph.is_of_origin.any():
         hold_first(graph, T_world_plane[:3, 2], height=False)
     across, none = np.outer(up, up), np.zeros((3, 3))
-    of_plane = np.block([[across / _UNEVEN_M**2, none], [none, (np.eye(3) - across) / _UNEVEN_RAD**2]])
+    of_plane = np.block([[across / _UNEVEN[0] ** 2, none], [none, (np.eye(3) - across) / _UNEVEN[1] ** 2]])
     Z = lie.inverse(T_world_plane) @ graph.poses[chosen]
     turns = np.zeros((len(Z), 6))
     turns[:, 3:] = np.cross(Z[:, :3, :3] @ up, [0.0, 0.0, 1.0])  # of small angles

@@ -46,6 +46,12 @@ def apart(T_a: Pose, T_b: Pose) -> tuple[float, float]:
     return geometry.apart(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
 
 
+def agree(T_a: Pose, T_b: Pose, meters: float, radians: float) -> bool:
+    """True if two poses are less than that apart."""
+    apart_m, apart_rad = apart(T_a, T_b)
+    return apart_m < meters and apart_rad < radians
+
+
 def transform(T: Pose, points: NDArray[np.floating]) -> Matrix:
     """Points (N, d) moved by one pose: R p + t."""
     d = T.shape[-1] - 1

@@ -14,12 +14,12 @@ from scanchain.graph.factors import edge_information
 from scanchain.graph.schedule import LAG, Schedule
 from scanchain.loops import ClosureTable, LoopCloser, SequentialPlaceTest
 from scanchain.loops.evidence import pose_by
+from scanchain.loops.recognizer import PLACE_DRIFT
 
 _TOO_FEW = Problem.plain("too few keyframes agree on the place")
 _CONTRADICTED = Problem.plain("withdrawn: later scans contradict the location")
 _REPLACED = Problem.plain("withdrawn: more of the path matches at another location in the map")
 _ELSEWHERE = Problem.plain("contradicts the location of the log in the map, at which more of the path matches")
-_DRIFT = 0.1  # largest distance of a match from the predicted pose, as a share of the path since the last match
 
 
 class Placement:
@@ -195,7 +195,7 @@ class Placement:
             return closures, ()
         components = self.closer.segments.components(self.graph)
         traveled_m = self.keyframes[-1].traveled_m - self.closer.search.matched_m
-        limit_m = max(_DRIFT * traveled_m, self.config.min_radius_m)
+        limit_m = max(PLACE_DRIFT * traveled_m, self.config.min_radius_m)
 
         def is_elsewhere(each: Closure) -> bool:
             if each.verdict is ClosureVerdict.REJECTED or components[each.target] != components[-1]:

@@ -22,16 +22,13 @@ from scanchain.data import Matrix, Points, Pose, RaySpan, Scan
 from scanchain.kernels import scans as kernels
 from scanchain.range_noise import RangeNoise
 
-_LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
-_GROWTH = 4  # of a table that has no room for all voxels
+_SLOTS = (1 << 10, 1 << 22)  # least and most of a table for downsampling that is kept
 _RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
-_DENSE, _SPARSE = 60_000, 40_000  # returns at which a scan becomes dense, and below which it no longer is
+_DENSE = (60_000, 40_000)  # returns at which scans become dense, and at which they remain so
 _FINE = math.sqrt(0.5)  # factor on the voxels of the map of dense scans, whose points fill finer ones
 _HYSTERESIS = 0.75  # distance to the target scale, in powers of two, above which the scale changes
 _STEP = 2.0  # factor by which the voxels of matching shrink or grow from one scan to the next, at most
-_MAX_TRIES = 8  # number of times the first scan is downsampled, at most
 _STRAIGHT_RAD = 0.005  # turn between two poses, whose chord is 0.2 mm off at 50 m
-_AHEAD = 2  # scans that are prepared before they are asked for
 _ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the choice of points would flicker
 
 
@@ -181,9 +178,9 @@ def first_per_voxel(
         count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, *room)
         if count >= 0:
             return chosen[:count].copy()
-        slots *= _GROWTH
+        slots *= 4
         table, chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
-        if slots <= _MOST_SLOTS:
+        if slots <= _SLOTS[1]:
             _scratch.table, _scratch.chosen = table, chosen
 
 
@@ -191,7 +188,7 @@ class _Scratch(threading.local):
     """Reused work arrays of each thread, no larger than its scans need: small ones stay in the CPU's cache."""
 
     def __init__(self) -> None:
-        self.table, self.chosen = np.empty(_LEAST_SLOTS, np.int64), np.empty(_LEAST_SLOTS // 2, np.int32)
+        self.table, self.chosen = np.empty(_SLOTS[0], np.int64), np.empty(_SLOTS[0] // 2, np.int32)
 
 
 _scratch = _Scratch()
@@ -214,7 +211,7 @@ class Resolution:
         self.scale = self.octave = 1.0
         self.is_dense = False
         self.match_voxel_m = config.match_voxel_m
-        self.tries = _MAX_TRIES
+        self.tries = 8  # to downsample the first scan
         self.noise = RangeNoise()
         self.is_fixed = config.min_scale == 1.0 and config.match_voxel_m <= config.map_voxel_m
 
@@ -238,7 +235,7 @@ class Resolution:
         target = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
         if abs(target - math.log2(self.octave)) > _HYSTERESIS:
             self.octave = min(max(2.0 ** round(target), self.config.min_scale), 1.0)
-        self.is_dense = returns >= (_SPARSE if self.is_dense else _DENSE)
+        self.is_dense = returns >= _DENSE[self.is_dense]
         self.scale = max(self.octave * (_FINE if self.is_dense else 1.0), self.config.min_scale)
         target_m = self.match_voxel_m * min(
             max(math.sqrt(len(points) / self.config.match_points), 1.0 / _STEP), _STEP
@@ -284,7 +281,7 @@ def prepare_ahead(scans: Iterable[Scan], resolution: Resolution) -> Iterator[Pre
     with ThreadPoolExecutor(1, thread_name_prefix="scanchain-prepare") as pool:
         for scan in scans:
             waiting.append(pool.submit(following, scan))
-            if len(waiting) > _AHEAD:
+            if len(waiting) > 2:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

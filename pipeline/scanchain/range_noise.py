@@ -14,17 +14,16 @@ from scanchain.data import RawPoints
 _SCANS, _EVERY = 30, 3  # number of the first scans, of which every third is measured
 _PATCHES = 300  # of a scan, evenly spread
 _FREEDOM = 4  # points of a patch beyond the parameters of its plane
-_MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: median below _WITHIN, first quintile
-_WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # a patch is planar up to this many noise variances; share below that
+_WITHIN = 3.0  # a patch is planar up to this many noise variances
+_OF_NOISE = (0.4122, 0.8216, 0.9826)  # χ² of 4 degrees of freedom over 4: quintile, median and share below _WITHIN
 _PLANAR = 0.5  # least share of planar patches at a range for its noise to be known
 _FEWEST = 60  # least number of patches at a range
-_CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is clutter
+_CLUTTER = (0.05, 0.1)  # share of the range and meters, above both of which a mode is clutter
 _LEAST_M = 1e-4  # smallest standard deviation reported: ranges may be rounded to one number
 _VARIES = 2.0  # ratio of the standard deviations at two ranges above which the noise is reported by range
 _KNOWN = 0.3  # least share of the patches at ranges whose noise is known
-_NEAREST_M = 0.05
 _SECTORS, _SECTOR_POINTS = 16, 8000  # a large first cloud: only parts of 16 sectors are searched for neighbors
-_WEDGE_POINTS, _WEDGE_PATCHES = 2000, 75  # later clouds: one wedge each, about another azimuth
+_WEDGE = (2000, 75)  # points and patches; later clouds: one wedge each, about another azimuth
 _GOLDEN = 0.618034  # share of the cloud's points between the middles of successive wedges
 
 
@@ -56,7 +55,7 @@ class RangeNoise:
             return replace(self, scans=self.scans + 1)
         if self.scans and points.shape[1] == 3 and len(points) > _SECTOR_POINTS:
             ranges_m, variances_m2 = _patches(
-                _wedge(points, int(_GOLDEN * self.scans % 1.0 * len(points))), _WEDGE_PATCHES
+                _wedge(points, int(_GOLDEN * self.scans % 1.0 * len(points))), _WEDGE[1]
             )
         else:
             ranges_m, variances_m2 = _patches(points, _PATCHES)
@@ -103,10 +102,10 @@ def _typical_m(
 
 
 def _wedge(points: RawPoints, middle: int) -> RawPoints:
-    """Points of a cloud (N, 3) in a wedge about the azimuth of one, sized for _WEDGE_POINTS without gaps."""
+    """Points of a cloud (N, 3) in a wedge about the azimuth of one, of as many points as wanted without gaps."""
     x, y = points[:, 0], points[:, 1]
     across = np.abs(x[middle] * y - y[middle] * x)
-    return points[across < math.tan(math.pi * _WEDGE_POINTS / len(points)) * (x[middle] * x + y[middle] * y)]
+    return points[across < math.tan(math.pi * _WEDGE[0] / len(points)) * (x[middle] * x + y[middle] * y)]
 
 
 def _patches(points: RawPoints, most: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -120,7 +119,7 @@ def _patches(points: RawPoints, most: int) -> tuple[NDArray[np.float64], NDArray
         points, azimuth = points[chosen], azimuth[chosen]
     rays = points.astype(np.float64)
     ranges_m = np.linalg.norm(rays, axis=1)
-    is_used = ranges_m > _NEAREST_M
+    is_used = ranges_m > 0.05
     rays, ranges_m, azimuth = rays[is_used], ranges_m[is_used], azimuth[is_used]
     count = len(rays)
     if count < size:
@@ -145,15 +144,15 @@ def _sigma_m(variances: NDArray[np.float64], range_m: float) -> float:
     """Standard deviation of the lowest mode of variances (P,) at that range; 0 where it is unknown."""
     if len(variances) < _FEWEST:
         return 0.0
-    variances = np.sort(variances)
-    variance = float(variances[len(variances) // 5]) / _FIFTH
+    variances, (quintile, median, share_within) = np.sort(variances), _OF_NOISE
+    variance = float(variances[len(variances) // 5]) / quintile
     for _ in range(30):
         before, count = variance, int(np.searchsorted(variances, _WITHIN * variance, side="right"))
         if count:
-            variance = 0.5 * float(variances[(count - 1) // 2] + variances[count // 2]) / _MEDIAN_WITHIN
+            variance = 0.5 * float(variances[(count - 1) // 2] + variances[count // 2]) / median
         if abs(variance - before) <= 1e-3 * before:
             break
-    planar = np.searchsorted(variances, _WITHIN * variance, side="right") / len(variances) / _SHARE_WITHIN
+    planar = np.searchsorted(variances, _WITHIN * variance, side="right") / len(variances) / share_within
     sigma_m = math.sqrt(variance)
-    is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
+    is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER[0] * range_m, _CLUTTER[1])
     return 0.0 if is_clutter else max(sigma_m, _LEAST_M)

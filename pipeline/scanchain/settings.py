@@ -18,7 +18,6 @@ from scanchain.config import Config
 from scanchain.config_keys import ConfigKey, Value, section_keys
 from scanchain.errors import InputError, one_line, shown
 
-_ALIKE = 0.75  # least similarity of a misspelled key to the suggested one, by difflib
 _ORDERED = (
     ("log.start_s", "log.end_s"),
     ("log.min_range_m", "log.max_range_m"),
@@ -78,7 +77,7 @@ def find_key(name: str, source: str) -> ConfigKey:
     if name in keys:
         return keys[name]
     same_leaf = [key for key in keys if key.rpartition(".")[2] == name.rpartition(".")[2]]
-    near = difflib.get_close_matches(name, same_leaf or keys, n=1, cutoff=0.0 if same_leaf else _ALIKE)
+    near = difflib.get_close_matches(name, same_leaf or keys, n=1, cutoff=0.0 if same_leaf else 0.75)
     subject, flag = (source, "--") if source == f"--{name}" else (f"{source}: {name}", "")
     nearest = "".join(f"did you mean {flag}{key}? " for key in near)
     raise InputError(f"{subject} is not a configuration key; {nearest}all keys: scanchain config show")

@@ -114,7 +114,6 @@ class Slam:
         *,
         dimension: int | None = None,
         prior: SavedMap | None = None,
-        prior_is_final: bool = True,
         is_live: bool = False,
     ) -> None:
         """Start before the first scan.
@@ -124,15 +123,12 @@ class Slam:
         is_live : whether no scan may wait: long searches are spread over several scans, large graphs optimized in
             parallel
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
-        prior_is_final : whether the poses of the map are final; else scans are matched to keyframes of one pass
         """
         config, T_start = checked_start(config, T_base_lidar, dimension)
         self.config, self.dimension = config, T_start.shape[0] - 1
         self.is_finished = False
         self.front_end = FrontEnd(config, T_base_lidar, self.dimension)
-        self.back_end = BackEnd(
-            config, self.dimension, prior=prior, prior_is_final=prior_is_final, is_live=is_live
-        )
+        self.back_end = BackEnd(config, self.dimension, prior=prior, is_live=is_live)
         self.steps = Steps()
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)  # rows of the points of each scan, if all are kept

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from scanchain.data import Integers, Matrix, State, Step, Trajectory, Vector
 from scanchain.growing_array import Columns
 
-_SINGULAR = 1e-12  # ratio of smallest to largest eigenvalue below which an information matrix is not inverted
-
 STAGES = ("read", "preprocess", "match", "map", "loops")
 SENSORS = ("wheels", "gyro", "accelerometer", "GNSS")  # that are compared with the matches
 _OF_SCAN = ("index", "stamp_ns", "log_time_ns", "dropped", "is_copy")
@@ -82,7 +80,7 @@ class Steps:
         informations = self.columns["information"]
         finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))
         values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
-        sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
+        sound = finite & (values[:, 0] > 1e-12 * values[:, -1]) & (values[:, -1] > 0.0)
         scaled = vectors / np.sqrt(np.where(sound[:, None], values, np.nan))[:, None, :]
         return self.columns["variance_factor"][:, None, None] * (scaled @ np.swapaxes(scaled, 1, 2))
 

@@ -19,7 +19,6 @@ _TUM_ROW, _KITTI_ROW = 7 * " %.9f", " ".join(12 * ["%.9e"]) + "\n"
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
 LEAST_VARIANCE = 1e-12  # m² or rad², of z, roll and pitch in the plane, and of what else would be singular
-_UNIT = 0.01  # largest deviation from 1 of the length of a quaternion, which may be written with two digits
 
 
 def read_tum(path: Path | str) -> Trajectory:
@@ -30,7 +29,7 @@ def read_tum(path: Path | str) -> Trajectory:
     path = Path(path, "trajectory.tum") if Path(path).is_dir() else path
     places, stamps_ns, values = table(path, "TUM line", _TUM_FIELDS, stamps=1)
     norms = np.linalg.norm(values[:, 3:], axis=1)
-    for bad in np.flatnonzero(np.abs(norms - 1.0) > _UNIT)[:1]:
+    for bad in np.flatnonzero(np.abs(norms - 1.0) > 0.01)[:1]:  # may be written with two digits
         raise InputError(
             f"{places[bad]} has a quaternion of length {norms[bad]:.3g}, not 1; a TUM line is {_TUM_FIELDS} "
             "(for a file of relations: scanchain evaluate --relations)"

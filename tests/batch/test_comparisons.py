@@ -7,6 +7,7 @@ from urllib.parse import unquote
 
 import pytest
 
+import scanchain
 from scanchain.__main__ import main
 from scanchain.batch.comparisons import compare_each, logs_of, publish
 from scanchain.comparison.methods import Variation, resolve
@@ -14,6 +15,7 @@ from scanchain.comparison.overall import OVERALL_FILE
 from scanchain.comparison.table import TABLE_FILE, read_table
 from scanchain.errors import InputError
 from scanchain.runs.job import Progress
+from scanchain.settings import Override
 from tests.support import made
 from tests.support.browser import look
 from tests.support.in_process import here
@@ -152,6 +154,15 @@ def test_parts_of_one_drive_are_one_log_and_other_files_are_one_each(logs, tmp_p
     assert logs_of([logs[0], wheels], "auto") == [(logs[0],), (wheels,)]  # which is missing, as its row says
 
 
+def test_a_topic_holds_for_the_logs_that_have_it(logs, settings, tmp_path):
+    town = made.log("town", folder=tmp_path / "town", seconds=1, sensor="vlp-16")
+    topic = scanchain.open_log(town).topic
+    given = {"overrides": (Override("log.topic", topic, "--topic"),), "progress": Announced()}
+    overall = compare([logs[0], town], tmp_path / "out", settings, **given)
+    assert [log.table.topic for log in overall.logs] == ["/scan", topic]
+    assert f"{logs[0]}: has no topic {topic}; its own lidar is used" in given["progress"].lines
+
+
 def test_a_directory_or_a_site_that_holds_something_else_is_left_alone(logs, settings, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.tex").touch()
@@ -244,6 +255,7 @@ def test_a_setting_is_varied_for_the_methods_that_have_it(logs, tmp_path, settin
             ["--vary", "max_iterations=5"],
             "--vary max_iterations: there are several, matching.max_iterations and graph",
         ),
+        (["--vary", "loops.enabled=true"], "--vary loops.enabled distinguishes plicp, svd, +loops and +imu"),
         (["--vary", "every=0"], "--vary every: log.every is 0; it must be a whole number >= 1"),
     ],
 )

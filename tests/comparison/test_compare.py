@@ -357,6 +357,21 @@ def test_methods_for_clouds_follow_planar_scans_in_the_plane(office, tmp_path):
     assert len(scans) == 30 * len(began) and not any(scans["z"].to_numpy())
 
 
+@pytest.mark.usefixtures("in_process")
+def test_a_method_for_clouds_alone_is_a_row_that_says_so_on_planar_scans(office, tmp_path):
+    table = run(
+        office,
+        tmp_path,
+        "genz-icp",
+        "mine",
+        config_file=toml(tmp_path / "good.toml", '[mine]\nmethod = "bad_odometries:Shifted"'),
+    )
+    genz, mine = table.rows
+    assert (genz.status, genz.reason) == (Status.NOT_APPLICABLE, "is made for 3D clouds, and the log is 2D")
+    assert mine.status is Status.OK and not Compared(tmp_path, table).failures
+    assert "genz-icp: not applicable: is made for 3D clouds" in text(table)
+
+
 # names and settings
 
 
@@ -397,8 +412,6 @@ def test_a_table_of_settings_sets_a_method_or_makes_a_variant_of_it_and_can_be_g
     [
         (["gicp"], 3, "", r"no method 'gicp'; choose among open3d-gicp, small-gicp, small-vgicp, or"),
         (["plicp", "icp"], 3, "", r"no method 'icp'; choose among plicp, plicp\+loops, plicp\+imu, open3d-gicp"),
-        (["genz-icp"], 2, "", "made for 3D"),
-        (["plicp", "open3d-p2l"], 2, "", "open3d-p2l is made for 3D"),
         (["open3d", "open3d-p2p"], 3, "", "names one twice"),
         (["kiss-icp"], 3, "[kiss-icp]\nvoxel_size = 0.5", r"a\.toml: \[kiss-icp\].*voxel_size.*voxel_size_m"),
         (["kiss-icp"], 3, "[kiss-icp]\nvoxel_size_m = -1.0", r"\[kiss-icp\]"),

@@ -12,7 +12,7 @@ from scanchain.comparison import worker
 from scanchain.comparison.evalio_pipelines import PIPELINES, ScanLines, entry_of
 from scanchain.comparison.methods import resolve
 from scanchain.data import Inertial, Trajectory
-from scanchain.errors import InputError, MissingExtraError
+from scanchain.errors import InputError, MissingExtraError, NotApplicableError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.simulation import plan
 from scanchain.simulation.imu import IMUS
@@ -131,8 +131,9 @@ def test_settings_are_evalios_parameters_stated_where_they_differ_from_its_defau
     with pytest.raises(InputError, match=r"evalio has no pipeline 'icp'; choose among ct, dlio, form"):
         resolve(["evalio:icp"], 3, file=None)
     assert [each.name for each in resolve(["evalio"], 3, file=None)] == list(PIPELINES)
-    with pytest.raises(InputError, match="made for 3D clouds"):
-        resolve(["evalio:kiss"], 2, file=None)
+    (planar,) = resolve(["evalio:kiss"], 2, file=None)
+    with pytest.raises(NotApplicableError, match="made for 3D clouds"):
+        worker.start(planar, np.eye(3))
 
 
 @with_evalio

@@ -70,7 +70,7 @@ def test_a_closure_that_moves_the_map_is_optimized_in_soon_and_one_that_joins_a_
 
 
 def test_a_jump_of_a_large_graph_is_found_in_the_poses_since_the_last_closure_that_agreed(monkeypatch):
-    monkeypatch.setattr(schedule, "_LARGE", 200)
+    monkeypatch.setattr(schedule, "LARGE", 200)
     monkeypatch.setattr(schedule, "LAG", 50)
     laps = Laps(wrong_at=600)
     laps.grow(659)
@@ -93,7 +93,7 @@ def test_all_poses_are_updated_where_that_is_little_work_and_else_the_last_ones(
 
 
 def test_a_live_log_waits_for_no_long_optimization_of_a_large_graph(monkeypatch):
-    monkeypatch.setattr(schedule, "_LARGE", 200)
+    monkeypatch.setattr(schedule, "LARGE", 200)
     laps = Laps()
     laps.grow(300, is_live=True)
     assert laps.schedule.background is not None and laps.schedule.background.due > 300

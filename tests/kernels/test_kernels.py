@@ -8,7 +8,7 @@ from scanchain.kernels.geometry import largest_magnitude, perturb
 from scanchain.kernels.registration import icp, residuals
 from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.residuals import normal_equations
-from scanchain.kernels.voxels import DIRECTION, SHAPE, insert
+from scanchain.kernels.voxels import Cell, insert
 from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
 from tests.support import naive
@@ -45,7 +45,7 @@ def paired(voxel_map, correspondence):
     d = voxel_map.dimension
     cells = voxel_map.voxels.cells
     return [
-        (i, cells[j, :d], SHAPES[cells[j, SHAPE]], cells[j, DIRECTION : DIRECTION + d])
+        (i, cells[j, :d], SHAPES[cells[j, Cell.SHAPE]], cells[j, Cell.DIRECTION : Cell.DIRECTION + d])
         for i, j in enumerate(correspondence)
         if j >= 0
     ]
@@ -93,10 +93,10 @@ def test_voxels_keep_the_mean_and_shape_of_their_points(dimension, alone):
         around = [members for other, members in groups.items() if other != key and adjacent(other, key)]
         kind, direction = naive.shape(naive.members_of(groups[key], around, alone, 0.5))
         np.testing.assert_allclose(cells[voxel, :dimension], groups[key].mean(0), atol=1e-12)
-        assert SHAPES[cells[voxel, SHAPE]] == kind
+        assert SHAPES[cells[voxel, Cell.SHAPE]] == kind
         seen.add(kind)
         if direction is not None:
-            assert abs(cells[voxel, DIRECTION : DIRECTION + dimension] @ direction) > 1.0 - 1e-9
+            assert abs(cells[voxel, Cell.DIRECTION : Cell.DIRECTION + dimension] @ direction) > 1.0 - 1e-9
     assert "plane" in seen
 
 
@@ -115,7 +115,7 @@ def test_shapes_of_noisy_points_are_cleared_of_the_noise_and_means_lie_on_the_su
         if kind == "plane" and members is not groups[key]:
             mean = naive.mean_of(groups[key], members, direction, 0.5, noise)
             off_m.append((abs(mean[1] - 2.0), abs(groups[key].mean(0)[1] - 2.0)))
-        assert SHAPES[cell[SHAPE]] == kind
+        assert SHAPES[cell[Cell.SHAPE]] == kind
         np.testing.assert_allclose(cell[:dimension], mean, atol=1e-9)
         seen.add(kind)
     assert {"plane", "point"} <= seen
@@ -189,7 +189,7 @@ def test_points_on_lines_have_no_negative_weight():
     points = np.ascontiguousarray((begin[:, None] + along[..., None] * direction[:, None]).reshape(-1, 3))
     voxel_map = map_of(points, size=1.0, alone=5)
     cells = voxel_map.voxels.cells[: len(voxel_map)]
-    assert (cells[:, voxels.THICKNESS] >= 0.0).all() and (cells[:, SHAPE] == 2.0).any()
+    assert (cells[:, Cell.THICKNESS] >= 0.0).all() and (cells[:, Cell.SHAPE] == 2.0).any()
     correspondence, weight = weighed(voxel_map, points, np.eye(4), 1.0)
     assert (correspondence >= 0).all() and ((weight >= 0.0) & (weight <= 1.0)).all()
 
@@ -304,13 +304,15 @@ def test_damped_solve_equals_numpy_and_says_so_where_the_system_is_singular(damp
     rng = np.random.default_rng(5)
     B, b = rng.normal(size=(8, 6)), rng.normal(size=6)
     H, x = B.T @ B, np.empty(6)
-    assert icp.step(icp.LEVENBERG_MARQUARDT, H, b, damping, np.empty((6, 6)), x)
+    assert icp.step(icp.Optimizer.LEVENBERG_MARQUARDT, H, b, damping, np.empty((6, 6)), x)
     np.testing.assert_allclose(x, -np.linalg.solve(H + damping * np.diag(np.diag(H)), b), rtol=1e-9)
     singular, room, x = np.diag([1.0, 0.0, 1.0]), np.empty((3, 3)), np.empty(3)
-    assert not icp.step(icp.LEVENBERG_MARQUARDT, singular, np.ones(3), 0.5, room, x)
+    assert not icp.step(icp.Optimizer.LEVENBERG_MARQUARDT, singular, np.ones(3), 0.5, room, x)
 
 
-@pytest.mark.parametrize("optimizer", [icp.NEWTON, icp.GAUSS_NEWTON, icp.GRADIENT_DESCENT])
+@pytest.mark.parametrize(
+    "optimizer", [icp.Optimizer.NEWTON, icp.Optimizer.GAUSS_NEWTON, icp.Optimizer.GRADIENT_DESCENT]
+)
 def test_a_step_decreases_a_quadratic_as_much_as_predicted(optimizer):
     rng = np.random.default_rng(6)
     B, b = rng.normal(size=(8, 6)), rng.normal(size=6)

@@ -181,7 +181,7 @@ def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lo
 
 @pytest.mark.parametrize(("sigma_rad", "are_refused"), [(0.002, True), (0.2, False)])
 def test_a_place_is_refused_that_odometry_cannot_have_missed_by_so_much(monkeypatch, sigma_rad, are_refused):
-    monkeypatch.setattr("scanchain.loops.recognizer._PLACE_DRIFT", 0.001)
+    monkeypatch.setattr("scanchain.loops.recognizer.PLACE_DRIFT", 0.001)
     keyframes, _ = there_and_back(8.0)
     closures = LoopCloser(configured(3), 3).places.close(
         keyframes, graph_of(keyframes, sigma_rad), np.ones(len(keyframes), bool), finish=True

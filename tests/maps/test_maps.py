@@ -14,13 +14,14 @@ from scanchain.config import MapsConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.formats.clouds import read_pcd
-from scanchain.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS, OCCUPIED_PROBABILITY
+from scanchain.maps.occupancy_grid import _LOG_ODDS, OCCUPIED_PROBABILITY
 from scanchain.runs.results import results_of
 from scanchain.slam import Slam
 from tests.support import made
 from tests.support import naive_maps as naive
 
 RESOLUTION_M = 0.1
+HIT, MISS, *_ = _LOG_ODDS
 CONFIG = MapsConfig(grid_resolution_m=RESOLUTION_M)
 ENDLESS = MapsConfig(grid_resolution_m=RESOLUTION_M, grid_max_range_m=LARGEST)
 
@@ -42,7 +43,7 @@ def cell(grid, x, y):
 
 def hits(grid):
     """Number of cells in which beams end."""
-    return int((grid.log_odds == np.float32(_HIT)).sum())
+    return int((grid.log_odds == np.float32(HIT)).sum())
 
 
 @pytest.mark.parametrize("batch", [1, 5])
@@ -57,7 +58,7 @@ def test_drawn_beams_equal_naive(batch):
         [(T[:2, 2], lie.transform(T, point[None])[0]) for point in scan]
         for T, scan in zip(poses, scans, strict=True)
     ]
-    expected = naive.draw(beams, RESOLUTION_M, _HIT, _MISS, _LOW, _HIGH)
+    expected = naive.draw(beams, RESOLUTION_M, *_LOG_ODDS)
     corner = np.round(grid.origin_m / RESOLUTION_M).astype(int)
     rows, columns = np.nonzero(grid.drawn)
     seen = {(int(c + corner[0]), int(r + corner[1])) for r, c in zip(rows, columns, strict=True)}
@@ -86,15 +87,15 @@ TILTED, FAR = lie.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0])), np.array([4.05,
 )  # fmt: skip
 def test_a_3d_scan_is_drawn_by_its_slice_at_the_height_of_the_lidar_along_the_worlds_vertical(T, points, hit):
     grid = maps.draw_grid([(T, points)], CONFIG)
-    assert hits(grid) == 1 and cell(grid, *hit) == np.float32(_HIT)
-    assert cell(grid, hit[0] - 1.5 * (T is TILTED), hit[1] - 1.5 * (T is TURNED)) == np.float32(_MISS)
+    assert hits(grid) == 1 and cell(grid, *hit) == np.float32(HIT)
+    assert cell(grid, hit[0] - 1.5 * (T is TILTED), hit[1] - 1.5 * (T is TURNED)) == np.float32(MISS)
 
 
 @pytest.mark.parametrize(("low", "high", "z"), [(0.5, 2.0, 1.0), (-2.0, -0.5, -1.0)])
 def test_a_beam_is_drawn_only_where_it_runs_within_the_slice(low, high, z):
     config = MapsConfig(grid_resolution_m=RESOLUTION_M, slice_min_z_m=low, slice_max_z_m=high)
     grid = maps.draw_grid([(lie.identity(3), np.array([[4.05, 0.05, z]]))], config)
-    assert cell(grid, 3.0, 0.05) == np.float32(_MISS)
+    assert cell(grid, 3.0, 0.05) == np.float32(MISS)
     assert grid.origin_m[0] == pytest.approx(2.0)
 
 

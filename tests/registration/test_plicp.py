@@ -67,7 +67,8 @@ def result(**changes):
     """A result without fault for 1000 points, but for these changes."""
     sound = Result(
         T=np.eye(3), information=np.eye(3), direction=np.eye(3)[0], eigenvalue=0.5, signal=9.0, fit=0.9,
-        range_m=9.0, residual_m=0.1, cost=1.0, pairs=990, on_surfaces=900, iterations=4, ending=icp.CONVERGED,
+        range_m=9.0, residual_m=0.1, cost=1.0, pairs=990, on_surfaces=900, iterations=4,
+        ending=icp.Ending.CONVERGED,
         variance_factor=1.0, systematic=np.zeros((3, 3)),
     )  # fmt: skip
     return sound._replace(**changes)
@@ -75,11 +76,11 @@ def result(**changes):
 
 FAULTS = [
     ({"T": np.full((3, 3), np.nan)}, "the pose is not finite"),
-    ({"ending": icp.NO_CORRESPONDENCES}, "no point has a correspondence in the map"),
+    ({"ending": icp.Ending.NO_CORRESPONDENCES}, "no point has a correspondence in the map"),
     ({"pairs": 290}, "290 of 1000 points have a correspondence, below the share matching.min_inlier_share (0.3)"),
     ({"signal": 1.5}, "motion along [1.00 0.00 0.00] is undetermined: observability 5.0e-01 < 1"),
     ({"eigenvalue": 1e-7}, "is undetermined: observability 1.0e-01 < 1"),
-    ({"ending": icp.OUT_OF_ITERATIONS}, "out of iterations (matching.max_iterations)"),
+    ({"ending": icp.Ending.OUT_OF_ITERATIONS}, "out of iterations (matching.max_iterations)"),
     ({"fit": 0.59}, "the correspondences contradict the pose: fit 0.59 < 0.6"),
     ({"residual_m": 0.21}, "residual 0.21 m > matching.kernel_scale_m (0.2)"),
     ({"pairs": 740}, "740 of 1000 points have a correspondence, fewer than 75 %"),

@@ -170,7 +170,7 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
 
 
 def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monkeypatch):
-    monkeypatch.setattr("scanchain.graph.schedule._LARGE", 10)
+    monkeypatch.setattr("scanchain.graph.schedule.LARGE", 10)
     monkeypatch.setattr("scanchain.graph.schedule.LAG", 5)
     monkeypatch.setattr("scanchain.placement.LAG", 5)
     log = open_log(office)

@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.kernels import voxels
-from scanchain.kernels.registration.icp import CONVERGED, align, problem_of
+from scanchain.kernels.registration.icp import Ending, align, problem_of
 
 
 def voxel_of(point, size):
@@ -220,15 +220,20 @@ def signal_along(voxel_map, problem, T, twist):
         if j < 0 or weight == 0.0:
             continue
         cell = of_map.cells[j]
-        n, u = cell[voxels.DIRECTION : voxels.DIRECTION + 3], cell[voxels.ACROSS : voxels.ACROSS + 3]
-        v, is_plane = np.cross(n, u), cell[voxels.SHAPE] == voxels.PLANE
+        n, u = (
+            cell[voxels.Cell.DIRECTION : voxels.Cell.DIRECTION + 3],
+            cell[voxels.Cell.ACROSS : voxels.Cell.ACROSS + 3],
+        )
+        v, is_plane = np.cross(n, u), cell[voxels.Cell.SHAPE] == voxels.PLANE
         p = lie.transform(T, point[None])[0] - problem.origin
         d = twist[:3] + np.cross(twist[3:], p)
         if is_plane:
-            m = 1.0 / cell[voxels.MEAN_TERM]
-            spread = cell[voxels.SLOPE_ACROSS] * np.outer(u, u) + cell[voxels.SLOPE_ALONG] * np.outer(v, v)
-            noise += weight * cell[voxels.THICKNESS] * m / max(m - 3.0, 1.0) * d @ spread @ d
-        if of_map.history[j, voxels.BORN] <= youngest:
+            m = 1.0 / cell[voxels.Cell.MEAN_TERM]
+            spread = cell[voxels.Cell.SLOPE_ACROSS] * np.outer(u, u) + cell[voxels.Cell.SLOPE_ALONG] * np.outer(
+                v, v
+            )
+            noise += weight * cell[voxels.Cell.THICKNESS] * m / max(m - 3.0, 1.0) * d @ spread @ d
+        if of_map.history[j, voxels.History.BORN] <= youngest:
             informative.append(weight * ((n @ d) ** 2 if is_plane else d @ d - (n @ d) ** 2))
             cells.append(voxels.unpack(of_map.keys[j]))
     dominant = np.array(cells[int(np.argmax(informative))])
@@ -299,5 +304,5 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         scan = points[first:last]
         problem = problem_of(voxels, scan, T, prior, settings)
         fit = align(problem, T, np.zeros(len(prior)), settings.first_scale_m)
-        if fit.ending == CONVERGED and fit.pairs >= least_share * (last - first):
+        if fit.ending == Ending.CONVERGED and fit.pairs >= least_share * (last - first):
             poses[k] = T

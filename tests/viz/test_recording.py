@@ -127,7 +127,7 @@ def test_loop_edges_end_on_their_keyframes_and_doubted_ones_are_pale(recorded):
     nodes = np.array(column(recorded[3], entities.KEYFRAMES, "Points3D:positions")[-1])
     np.testing.assert_array_equal(strips, [[nodes[0], nodes[4]], [nodes[0], nodes[8]]])
     colors = column(recorded[3], entities.ACCEPTED, "LineStrips3D:colors")[-1]
-    red, green, blue = entities.PALE_GREEN
+    red, green, blue = entities.Color.PALE_GREEN
     assert colors[0] == (red << 24) + (green << 16) + (blue << 8) + 255 != colors[1]
 
 

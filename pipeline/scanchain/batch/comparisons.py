@@ -28,8 +28,10 @@ from scanchain.files import Source
 from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.opening import index_files
 from scanchain.logs.stream import are_parts
+from scanchain.logs.topics import topics_of
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import identity_of
+from scanchain.settings import Override, named
 
 _STOPPED = "not compared: stopped by the user"
 _RECORDING, _REPORT, _INDEX = "compare.rrd", "report.html", "index.html"
@@ -93,7 +95,8 @@ def compare_each(
 ) -> Overall:
     """Compare methods on each log that has no result in ``out`` yet, and write the statistics over all.
 
-    present, given : as of ``compare``; in the file of true poses or relations {} stands for the name of the log
+    present, given : as of ``compare``; a lidar topic holds for the logs that have it, in the file of true poses or
+        relations {} stands for the name of the log
     work : where it is done; None for this process, one log after the other, so that times are comparable
     force : whether results of earlier calls are replaced
     On Ctrl-C the log in progress is discarded, and those not begun are listed as such. A log that cannot be read
@@ -101,7 +104,7 @@ def compare_each(
     """
     check_out(out, [file for files in logs for file in files], "a comparison of several logs", OVERALL_FILE)
     out.mkdir(parents=True, exist_ok=True)
-    tasks = [_task(files, out, present, given) for files in logs]
+    tasks = [_task(files, out, present, given | _topic_of(files, given, progress)) for files in logs]
     reasons = {task.folder: _STOPPED for task in tasks}
     waiting = [task for task in tasks if force or not (task.folder / TABLE_FILE).is_file()]
     if kept := len(tasks) - len(waiting):
@@ -147,6 +150,20 @@ def _task(files: tuple[Source, ...], out: Path, present: Callable[[Path], None],
     rest = {name: value for name, value in own.items() if name not in ("overrides", "command", "config_file")}
     text = f"{key} {sorted(rest.items())} {'' if file is None else file.read_text(encoding='utf-8')}"
     return Task(files, out / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:8]}", present, own)
+
+
+def _topic_of(files: Sequence[Source], given: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+    """The overrides without a lidar topic that the log does not have: another log of the comparison has it."""
+    overrides: Sequence[Override] = given.get("overrides", ())
+    wanted = named(overrides, "log.topic")
+    try:
+        known = topics_of(index_files(files)) if wanted else {}
+    except InputError:  # comparing says why
+        return {}
+    if not wanted or any(topic.strip() in known for topic in wanted.split(",")):
+        return {}
+    progress.announce(f"{files[0]}: has no topic {wanted}; its own lidar is used")
+    return {"overrides": tuple(each for each in overrides if each.key != "log.topic")}
 
 
 def _compared(task: Task, reason: str) -> ComparedLog:

@@ -23,17 +23,16 @@ from scanchain.logs.messages.lidar import with_offsets
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.stream import decoded_messages
 from scanchain.odometry import Odometry, Tracked
-from scanchain.odometry.delay import WheelDelay
+from scanchain.odometry.delay import LONGEST_S, WheelDelay
+from scanchain.odometry.elevation import POINTS, cell_of
 from scanchain.preprocess import first_per_voxel
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.registration.search import evenly
 from scanchain.runs.job import Progress
 from scanchain.settings import Override, load_settings
 
-_SCANS, _FEWEST, _POINTS = 16, 5, 3500  # scans of a window, least number; most points of each lidar in each scan
-_SPACING, _DENSE = 0.9, 0.4  # distance of the scans of a window, in cells; with several lidars
-_STANDING = 5  # scans after which one is added although the lidar hardly moves, with several lidars
-_RANGE_M, _SMALLEST_M = 14.0, 0.125  # median range at which cells are 1 m, and smallest cell
+_SCANS = (5, 16)  # least and largest number of scans of a window
+_SPACING = (0.9, 0.4)  # distance of the scans of a window, in cells, and with several lidars
 _FINE = 0.5  # factor on the cells in which several lidars are compared: coarse ones hide that surfaces are curved
 _SIGNIFICANT = 2.0  # standard deviations of a value that is corrected
 _CONTRADICTED = 2.5  # standard deviations between level and upright planes above which a range offset is none
@@ -44,7 +43,6 @@ _UNITS = {"deg": (0.3, _DEG), "m": (0.05, 1.0), "": (0.01, 1.0), "s": (0.02, 1.0
 _ANGLES = ("roll", "pitch", "yaw")
 _AT, _WINDOW = (0.5, 0.25, 0.75, 0.0, 1.0), 300  # windows in which the delay of wheels is found, and their scans
 _WITHOUT_WHEELS = (Override("odometry.prior", "constant-velocity", "doctor"),)
-_FEWEST_MATCHED, _LONGEST_NS = 100, 500_000_000  # points of a scan to align; time between two scans
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +119,9 @@ def calibrate(log: Log, config: Config, progress: Progress) -> Calibration:
         nothing = found.points[:0]
         bare = replace(scan, points=scan.points[:0], times_s=scan.times_s[:0], others=())
         tracked.append(msgspec.structs.replace(found, scan=bare, points=nothing, matched=nothing))
-    if len(tracked) < _FEWEST:
+    if len(tracked) < _SCANS[0]:
         raise InputError(
-            f"{log.name}: has {counted(len(tracked), 'scan')}; a calibration needs {_FEWEST} at least"
+            f"{log.name}: has {counted(len(tracked), 'scan')}; a calibration needs {_SCANS[0]} at least"
         )
     result, begin_ns = Calibration(), tracked[0].scan.stamp_ns
     motions = _motions(tracked)
@@ -170,19 +168,18 @@ class _Collector:
         if not scan.index or not len(tracked.points):
             return
         if not self.cell_m:
-            range_m = float(np.median(np.linalg.norm(tracked.points, axis=1)))
-            self.cell_m = min(max(2.0 ** round(math.log2(range_m / _RANGE_M)), _SMALLEST_M), 1.0)
-        spacing = _DENSE if self.T_first_others else _SPACING
+            self.cell_m = cell_of(tracked.points)
+        spacing = _SPACING[bool(self.T_first_others)]
         is_far = self.T_last is None or lie.apart(self.T_last, tracked.T_odom_lidar)[0] >= spacing * self.cell_m
-        if not is_far and not (self.T_first_others and self.since >= _STANDING):
-            return
+        if not is_far and not (self.T_first_others and self.since >= 5):
+            return  # with several lidars, standing scans are of use, too
         self.T_last, self.since = tracked.T_odom_lidar, 0
         if not self.collected[-1] and self.left_out < len(self.collected) - 1:
             self.left_out += 1
             return
         others = [self._points_of(scan, T_first_other) for T_first_other in self.T_first_others]
-        self.collected[-1].append(_Taken(scan.index, evenly(tracked.points, _POINTS), others))
-        if len(self.collected[-1]) == _SCANS:
+        self.collected[-1].append(_Taken(scan.index, evenly(tracked.points, POINTS), others))
+        if len(self.collected[-1]) == _SCANS[1]:
             self.left_out = 0
             self.collected.append([])
 
@@ -196,7 +193,7 @@ class _Collector:
         points = lie.transform(lie.inverse(T_first_other), seen)
         voxel_m = self.odometry.resolution.scale * limits.map_voxel_m
         chosen = first_per_voxel(points, voxel_m, limits.min_range_m, limits.max_range_m)
-        chosen = chosen[:: max(math.ceil(len(chosen) / _POINTS), 1)]
+        chosen = chosen[:: max(math.ceil(len(chosen) / POINTS), 1)]
         return Others(points[chosen], np.concatenate([each.times_s for each in found])[chosen].astype(np.float64))
 
     def windows(self, tracked: Sequence[Tracked]) -> list[Window]:
@@ -207,7 +204,7 @@ class _Collector:
         rates = np.concatenate([rates[:1], rates, rates[-1:]])
         found = list[Window]()
         for taken in self.collected:
-            if len(taken) >= _FEWEST:
+            if len(taken) >= _SCANS[0]:
                 numbers = np.array([each.number for each in taken])
                 others = [[each.others[o] for each in taken] for o in range(len(self.T_first_others))]
                 twists = np.stack([rates[numbers], rates[numbers + 1]], axis=1)
@@ -218,12 +215,10 @@ class _Collector:
 def _motions(tracked: Sequence[Tracked]) -> Motions:
     """Motions between consecutive scans whose poses are determined; times since the first scan."""
     stamps_ns = np.array([each.scan.stamp_ns for each in tracked])
-    T, ok = (
-        np.array([each.T_odom_lidar for each in tracked]),
-        np.array([each.state is State.OK for each in tracked]),
-    )
+    T = np.array([each.T_odom_lidar for each in tracked])
+    ok = np.array([each.state is State.OK for each in tracked])
     lasted_ns, ok[0] = np.diff(stamps_ns), False  # the first scan is not deskewed
-    is_motion = ok[:-1] & ok[1:] & (lasted_ns > 0) & (lasted_ns < _LONGEST_NS)
+    is_motion = ok[:-1] & ok[1:] & (lasted_ns > 0) & (lasted_ns < 1e9 * LONGEST_S)
     is_motion &= np.array([not each.is_repeated for each in tracked[1:]])
     times_s = 1e-9 * (stamps_ns - stamps_ns[0])
     return Motions(np.column_stack([times_s[:-1], times_s[1:]]), lie.between(T[:-1], T[1:])).where(is_motion)
@@ -283,7 +278,7 @@ def _matched(windows: Sequence[Window], lidar: int, T_first_other: Pose, odometr
             for points, T in zip(window.own, window.poses, strict=True):
                 local_map.insert(points, T)
             for points, T in zip(window.others_in_first(lidar, T_first_other), window.poses, strict=True):
-                match = matcher.align(points, local_map, T, wide=True) if len(points) > _FEWEST_MATCHED else None
+                match = matcher.align(points, local_map, T, wide=True) if len(points) > 100 else None
                 if match is not None and match.is_fit:
                     H += match.information
                     b += match.information @ lie.log(lie.between(T, match.T_target_source))

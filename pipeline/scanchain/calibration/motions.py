@@ -16,7 +16,6 @@ from scanchain.registration.hand_eye import hand_eye, path_m
 _STEPS, _STEP = 20, 0.01  # most Gauss-Newton steps; step of a converged parameter, in standard deviations
 _BLOCK = 4  # consecutive motions whose errors may depend on each other
 _KERNEL = 2.0  # normalized residual at which a motion has half its weight
-_DIFFERENCE = 1e-6  # of numerical derivatives
 _MOVING = 0.2  # share of the length of a fast motion below which wheels are taken to stand
 _GYRO_PRIOR = np.array([0.2] * 3 + [0.1] * 3 + [0.2])  # σ of rotation, bias and delay
 _WHEELS_PRIOR = np.array([1.0, 1.0, 0.2, 0.2, 0.2, 0.2, 0.2, 0.05, 0.3])  # of the parameters of ``Wheels``
@@ -61,8 +60,8 @@ def fitted(residuals: Callable[[Vector], Matrix], first: Vector, prior: Vector) 
     x, m, covariance = first, len(first), np.diag(prior**2)
     P = np.diag(prior**-2.0)
     for _ in range(_STEPS):
-        r = residuals(x)
-        J = np.stack([(residuals(x + each) - r) / _DIFFERENCE for each in _DIFFERENCE * np.eye(m)], axis=-1)
+        r, step = residuals(x), 1e-6
+        J = np.stack([(residuals(x + each) - r) / step for each in step * np.eye(m)], axis=-1)
         sigma = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9)
         r, J = r / sigma, J / sigma[:, None]
         weight = 1.0 / (1.0 + np.mean(r**2, axis=1) / _KERNEL**2)

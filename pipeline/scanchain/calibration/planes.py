@@ -12,13 +12,12 @@ from scipy.sparse import csr_matrix, hstack
 
 from scanchain import lie
 from scanchain.data import Integers, Mask, Matrix, Points, Pose, Vector
-from scanchain.kernels.registration.plane_adjustment import planes
+from scanchain.kernels.registration.plane_adjustment import LEAST_SLOPE, planes
 from scanchain.logs.messages.lidar import with_offsets
+from scanchain.odometry.elevation import kernel_scale
 from scanchain.preprocess import ScanMotion
 
 _STEPS, _STEP = 12, 0.02  # most Gauss-Newton steps; step of a converged parameter, in standard deviations
-_KERNEL = 1.5 / 0.6745  # scale of the robust weight over the median residual
-_LEAST_SLOPE = 0.4  # least ratio of Σψ' to Σw, which limits the extension of steps
 _RIDGE = 1e-9  # regularizes planes and poses that few points constrain
 _REGION_CELLS = 8.0  # edge, in cells, of the regions whose errors count as independent
 _LEVEL = 0.7  # least vertical component of the normal of a level plane
@@ -153,10 +152,8 @@ def adjust(
 
 def _contradiction(known: Sequence[_Equations], by: Vector) -> float:
     """Difference, in standard deviations, of a parameter by level and by upright planes; ``by`` : row of M⁻¹."""
-    found, is_level = (
-        np.concatenate([each.scores @ by for each in known]),
-        np.concatenate([each.is_level for each in known]),
-    )
+    found = np.concatenate([each.scores @ by for each in known])
+    is_level = np.concatenate([each.is_level for each in known])
     level, upright = float(np.sum(found[is_level] ** 2)), float(np.sum(found[~is_level] ** 2))
     if not level or not upright:
         return 0.0
@@ -202,7 +199,7 @@ def _equations(window: Window, offsets: Vector, T_others: Matrix) -> _Equations 
     q = 6 * K
     if P < K:
         return None
-    scale_m = max(_KERNEL * float(np.median(np.abs(residual))), 1e-6)
+    scale_m = kernel_scale(residual)
     square = (residual / scale_m) ** 2
     weight = (1.0 + square) ** -2
     slopes = float(np.sum(weight * (1.0 - 3.0 * square) / (1.0 + square)))
@@ -235,7 +232,7 @@ def _equations(window: Window, offsets: Vector, T_others: Matrix) -> _Equations 
         scores=csr_matrix((np.ones(P), region.ravel(), np.arange(P + 1)), (P, len(regions))).T @ scores,
         is_level=regions[:, 3] > 0.0,
         variance=(scale_m / 1.5) ** 2,
-        gain=float(weight.sum()) / max(slopes, _LEAST_SLOPE * float(weight.sum())),
+        gain=float(weight.sum()) / max(slopes, LEAST_SLOPE * float(weight.sum())),
         T_step=by_poses[:, 0],
         T_by=by_poses[:, 1:],
     )

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from scanchain.comparison.overall import Overall
 
 Varied = Mapping[str, Mapping[str, "Overall"]]  # by key and value of --vary
-_DAY_S = 86_400.0  # time limit of a log where none is given
 
 
 def _variations(_: object, __: object, words: Sequence[str]) -> list[tuple[str, list[str]]]:
@@ -120,7 +119,7 @@ def batch(
         overrides=overrides,
         arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in overrides)),
         workers=workers or os.cpu_count() or 1,
-        time_s=time_s or _DAY_S,
+        time_s=time_s or 86_400.0,
         **limits,
     )
     from scanchain_viz.report.batch import write_batch_report
@@ -197,9 +196,10 @@ def compare(
 
     Several LOGs that are the parts of one drive are one log. Otherwise methods are compared on each, also of a
     folder or a quoted pattern, and DIR gets a folder per log and the statistics over all: medians with confidence
-    intervals, wins, ranks. Called again, only the logs that have no result yet are compared. In --gt and
-    --relations {} stands for the name of the log. --ray, --site and --vary hold for one log, too. KEY of --vary is
-    one of the configuration or of a method, or the last part of it; it is set for all methods that have it.
+    intervals, wins, ranks. Called again, only the logs that have no result yet are compared. --topic holds for the
+    logs that have it; in --gt and --relations {} stands for the name of the log. --ray, --site and --vary hold for
+    one log, too. KEY of --vary is one of the configuration or of a method, or the last part of it; methods that
+    have it take part.
 
     \b
     Methods:
@@ -208,7 +208,7 @@ def compare(
       plicp+imu, svd+imu       ours, with the log's IMU
       CLASS, CLASS+loops, CLASS+imu    ours with the matcher of --matcher MODULE:CLASS
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
-      open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
+      open3d-p2l, open3d-multiscale, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
       rko-lio                  3D only, with the log's IMU
       evalio:ct, evalio:kiss, …    3D only, the pipelines of evalio; evalio stands for all of them
       my_module:MyOdometry     your own class: register(points, stamp_s, times_s) returns the pose

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from scanchain.graph.optimization import GraphChange, Optimization
 
 _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
-_POOR_FIT = 10.0  # χ² per degree of freedom above which a slightly wrong noise model is no explanation
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
@@ -243,7 +242,8 @@ class _Report:
             )
         notes += [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
         ratio = after.chi2 / max(after.degrees_of_freedom, 1)
-        if not graph.is_loop.any() and after.degrees_of_freedom and ratio > _POOR_FIT:
+        # a slightly wrong noise model is no explanation
+        if not graph.is_loop.any() and after.degrees_of_freedom and ratio > 10.0:
             notes.append(
                 f"chi2 is {ratio:.3g} per degree of freedom, where 1 is expected: some edges are wrong, or the "
                 "information matrices are too large; --robust truncated finds wrong loop edges"

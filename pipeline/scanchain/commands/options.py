@@ -19,14 +19,13 @@ from scanchain.processes import MIB_PER_GIB
 from scanchain.settings import Override
 from scanchain.threads import MOST, use_threads
 
-_GARBAGE_EVERY = 500_000  # new objects between two garbage collections; frequent ones cost 5 % of the time
 _ALIASES = "scanchain.commands.aliases"
 PATH = click.Path(path_type=Path)
 
 
 def collect_garbage_seldom() -> None:
     """Run the garbage collector less often, for commands that process a log."""
-    gc.set_threshold(_GARBAGE_EVERY)
+    gc.set_threshold(500_000)  # new objects; frequent collections cost 5 % of the time
 
 
 class NumberRange(click.FloatRange):

@@ -19,7 +19,6 @@ from scanchain.runs.job import Progress
 if TYPE_CHECKING:
     from scanchain.data import Scan
 
-_REDRAW_S = 0.2  # shortest time between two drawings of a bar
 _CLEAR = "\r\033[K"  # moves to the start of the line and clears it
 _WIDTH = 30  # characters of a full bar
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -80,11 +79,11 @@ class Terminal(Progress):
             click.echo(f"{_CLEAR}{text}", nl=done == total, err=True)
 
     def count(self, done: int, total: int) -> None:
-        """Show how many are done, at most every ``_REDRAW_S``."""
+        """Show how many are done, at most every 0.2 s."""
         now_s = monotonic()
         if not self.started_s:
             self.started_s, self.first = now_s, done
-        if not self.is_seen or (now_s - self.drawn_s < _REDRAW_S and done < total):
+        if not self.is_seen or (now_s - self.drawn_s < 0.2 and done < total):
             return
         self.drawn_s = now_s
         bar = "━" * round(_WIDTH * min(done / max(total, 1), 1.0))

@@ -22,7 +22,7 @@ from scanchain.settings import Override, config_keys, leaves, load_settings, rea
 _ANY = "matcher"  # ours with the matcher that the settings name
 _VARIANTS = ("", "+loops", "+imu")  # of ours
 OURS = tuple(f"{name}{variant}" for name in (*MATCHERS, _ANY) for variant in _VARIANTS)
-_ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti")
+_ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti", "open3d-multiscale")
 COMMAND = "command"  # base of a method that is a command, and the key of its table
 SCANS, POSES = "{scans}", "{poses}"  # in a command: the folder of PLY files, and the TUM file that it writes
 _BASE = "method"  # the key of a table that names the method it is a variant of
@@ -77,7 +77,7 @@ class Variation(NamedTuple):
             return None
         own = method.settings | {self.key: tomllib.loads(f"value = {self.value}")["value"]}
         if (entry := entry_of(method.base)) is not None:
-            own = _their_settings(method.name, entry, own, dimension, f"--vary {self.key}")
+            own = _their_settings(entry, own, dimension, f"--vary {self.key}")
         return msgspec.structs.replace(method, settings=own)
 
 
@@ -124,12 +124,13 @@ def resolve(
         )
     if len(set(names)) < len(names):
         raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --config instead")
+    overrides = (*overrides, *(variation.overrides if variation else ()))
     for override in overrides:
         if override.key in _KINDS:
             raise InputError(
                 f"{override.flag} distinguishes plicp, svd, +loops and +imu; choose by --methods or --matcher"
             )
-    ours = (shared_settings(file), (*overrides, *(variation.overrides if variation else ())))
+    ours = (shared_settings(file), overrides)
     methods = [_method(name, tables.get(name, {}), dimension, f"{file}: [{name}]", *ours) for name in names]
     varied = methods if variation is None else [variation.of(method, dimension) for method in methods]
     if variation is not None and not any(varied):
@@ -165,7 +166,7 @@ def _method(
     if base in OURS:
         own = _our_settings(base, _overrides(own, where), dimension, shared, overrides)
     elif (entry := entry_of(base)) is not None:
-        own = _their_settings(name, entry, own, dimension, where)
+        own = _their_settings(entry, own, dimension, where)
     elif not is_class_name(base):
         known, word = (*OURS, *BASELINES, *PIPELINES), base.lower()
         near = [each for each in known if word in each] or difflib.get_close_matches(word, known) or known
@@ -188,10 +189,8 @@ def _spelled_out(name: str, dimension: int) -> Sequence[str]:
     ] or [word if word in BASELINES else name]
 
 
-def _their_settings(name: str, entry: Entry, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
-    defaults = entry.settings if dimension == 3 else entry.planar
-    if defaults is None:
-        raise InputError(f"{name} is made for 3D clouds, the log is 2D; leave it out of --methods")
+def _their_settings(entry: Entry, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
+    defaults = entry.planar if dimension == 2 and entry.planar is not None else entry.settings
     try:
         return msgspec.to_builtins(msgspec.convert(msgspec.to_builtins(defaults) | own, type(defaults)))
     except msgspec.ValidationError as error:

@@ -51,6 +51,8 @@ class _Others:
     def __init__(self, method: Method, dimension: int) -> None:
         entry, self.register = entry_of(method.base), None
         if entry is not None:
+            if dimension == 2 and entry.planar is None:
+                raise NotApplicableError("is made for 3D clouds, and the log is 2D")
             self.odometry = entry.make(msgspec.convert(method.settings, type(entry.settings)))
             if dimension == 2:
                 self.odometry = InPlane(self.odometry, is_raised=entry.is_raised)

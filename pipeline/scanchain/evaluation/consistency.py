@@ -20,7 +20,6 @@ from scanchain.graph.factors import turns
 from scanchain.graph.pose_graph import PoseGraph
 
 _BATCHES, _BATCH = 50, 10  # number and size of batches of samples: all at once would fill the memory
-_BOUNDS = (2.5, 97.5)  # percentiles of the error bar
 _RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions leave a rotation free
 _DRIFT_OF_NOISE = 2.0  # drift of a map over its renewal, in standard deviations of independent errors of the scans
 _DRIFT_OF_SYSTEMATIC = 5.0  # the same of errors that successive scans have in common; measured on simulated worlds
@@ -28,13 +27,10 @@ _REVISIT = 2.0  # variances of the systematic error in a loop edge: of both pass
 _OVERESTIMATE = 2.0  # variance of the jackknife over the true one: see ``_scales``
 _MOST_MEDIANS = 3.0  # influence of a group of directions over the median, above which the log needs the group
 _MOST_OPEN = 0.5  # largest standard deviation of the instant of a pose in a distorted scan, over its duration
-_LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
 
 RADIUS_M = {2: 0.2, 3: 0.5}  # of the neighborhood whose thickness is measured, by dimension
 REACH_M = 40.0  # largest range of the points that are compared: those farther off are too sparse
-MIN_NEIGHBORS = 10  # fewest points in a neighborhood whose thickness is measured
 MAX_POINTS, MAX_QUERIES = 600_000, 15_000  # of a map, and of them those whose neighborhoods are measured: seconds
-_AT_ONCE = 64  # number of queries whose neighbors are in memory at a time
 _MIN_COVERAGE = 0.5  # least share of the query points of the best map that another must cover to be compared
 
 
@@ -181,14 +177,12 @@ def with_map_errors(
     systematic_drift : the 5; 0 where systematic drift is measured instead
     """
     k, of_scans = graph.freedom, np.flatnonzero(graph.is_odometry | graph.is_loop)
-    source, is_loop, information = (
-        graph.edges[of_scans].max(axis=1),
-        graph.is_loop[of_scans],
-        graph.information.copy(),
-    )
+    source = graph.edges[of_scans].max(axis=1)
+    is_loop = graph.is_loop[of_scans]
+    information = graph.information.copy()
     chosen = [map_errors[index] for index in source.tolist()]
     covariance, by_itself = edge_errors(information[of_scans], is_loop, chosen, config, systematic_drift)
-    judged = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(k))
+    judged = np.linalg.inv(covariance + 1e-14 * np.eye(k))  # regular at standstill, too
     information[of_scans] = 0.5 * (judged + np.swapaxes(judged, 1, 2))
     own = np.zeros((len(graph), k, k))
     own[source[~is_loop]] = by_itself[~is_loop]
@@ -260,8 +254,8 @@ def _rms_m(errors: Matrix, d: int) -> Vector:
 
 
 def _expected(ates_m: Vector) -> ExpectedError:
-    """Mean and bounds of samples."""
-    low, high = np.percentile(ates_m, _BOUNDS).tolist()
+    """Mean and 95 % interval of samples."""
+    low, high = np.percentile(ates_m, (2.5, 97.5)).tolist()
     return ExpectedError(float(ates_m.mean()), low, high)
 
 
@@ -402,10 +396,10 @@ def _eigenvalues(points: Points) -> Matrix:
     queries = points[:: max(1, len(points) // MAX_QUERIES)]
     tree = KDTree(points)
     covariances = np.full((len(queries), d, d), np.nan)
-    for begin in range(0, len(queries), _AT_ONCE):  # all neighbors of all queries take gigabytes
-        some = queries[begin : begin + _AT_ONCE]
+    for begin in range(0, len(queries), 64):  # all neighbors of all queries take gigabytes
+        some = queries[begin : begin + 64]
         for row, chosen in enumerate(tree.query_ball_point(some, RADIUS_M[d], return_sorted=False), begin):
-            if len(chosen) >= MIN_NEIGHBORS:
+            if len(chosen) >= 10:  # fewer give no thickness
                 offsets = points[chosen] - queries[row]
                 offsets -= offsets.mean(axis=0)
                 covariances[row] = offsets.T @ offsets / (len(chosen) - 1)

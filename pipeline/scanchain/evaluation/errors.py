@@ -25,7 +25,7 @@ KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)  # of
 SHORT_LENGTHS_M = (10.0, 20.0, 40.0)  # of segments of paths that are too short for these
 RELATION_LIMIT_S = 1e-3  # between a stamp of a relation and that of its pose; either may be in milliseconds
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
-_FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # ATE above both of which odometry failed: share of the path, meters
+_FAR_OFF = (0.02, 0.1)  # ATE above both of which odometry failed: share of the path, meters
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
 _LARGEST = 2.0  # largest length of a segment over the requested one
 _LONG_PATH_M = 200.0  # shortest path on which the published lengths allow several starts
@@ -179,11 +179,11 @@ class AbsoluteError(Metric):
 
 def far_off(ate_rmse_m: float, share: float | None, path_length_m: float) -> str:
     """Warning that an ATE is too large for odometry that works; empty where it is not."""
-    if share is None or share <= _FAR_OFF_SHARE or ate_rmse_m <= _FAR_OFF_M:
+    if share is None or share <= _FAR_OFF[0] or ate_rmse_m <= _FAR_OFF[1]:
         return ""
     return (
         f"far from the ground truth: ATE {ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
-        f"{path_length_m:.1f} m; above {100.0 * _FAR_OFF_SHARE:g} % a trajectory is wrong somewhere, or the truth "
+        f"{path_length_m:.1f} m; above {100.0 * _FAR_OFF[0]:g} % a trajectory is wrong somewhere, or the truth "
         "is in another unit, uses another clock or follows another body"
     )
 

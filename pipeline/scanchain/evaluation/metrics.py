@@ -29,7 +29,6 @@ from scanchain.evaluation.pairing import Pairs, pair, read_truth
 from scanchain.trajectory import read_tum
 
 _FARTHEST_S, _STEP_S = 1.0, 0.05  # largest offset tried, and step between offsets
-_EXACT_S = 1e-5  # error of the offset at which the search ends
 _FLAT = 1.02  # ratio of the ATE at the farthest offsets to the least, below which it does not depend on the offset
 
 
@@ -88,7 +87,7 @@ def find_time_offset(
     if best in (0, len(offsets_s) - 1):
         raise InputError(f"the time offset is not within {_FARTHEST_S:g} s; give it in seconds")
     found = minimize_scalar(
-        ate_m, bounds=(offsets_s[best - 1], offsets_s[best + 1]), method="bounded", options={"xatol": _EXACT_S}
+        ate_m, bounds=(offsets_s[best - 1], offsets_s[best + 1]), method="bounded", options={"xatol": 1e-5}
     )
     return float(found.x)
 

@@ -13,15 +13,13 @@ from scanchain.data import Matrix, Trajectory, brief
 from scanchain.errors import InputError, counted
 from scanchain.trajectory import read_kitti, read_tum, text_lines
 
-_WIDEST_GAP_S = 0.6  # default widest gap in the reference: at 1 m/s² a line is up to 5 cm off within it
-_SHORTEST_GAP_S = 0.1  # least default gap: at 1 m/s² a straight line is up to 1.3 mm off within it
+# least and most of the default widest gap: at 1 m/s² a straight line is up to 1.3 mm and up to 5 cm off within it
+_GAPS_S = (0.1, 0.6)
 _INTERVALS = 5.0  # median intervals of the reference that the default widest gap has at least
-_SAME_S = 1e-6  # largest error of a stamp that was a floating-point number of seconds
-_ROUNDED_S = 5e-4  # largest error of a stamp written in milliseconds
+_ERRORS_S = (1e-6, 5e-4)  # largest of a stamp that was a floating-point number of seconds, or in milliseconds
 _FEW = 10  # number of poses below which their error has little meaning
 _FEWEST_AFTER_START = 4  # pairs with the first pose, of which three remain: as many as a rigid alignment takes
 _ROUNDING_SHARE = 0.1  # share of the reference's median interval that either error is at most
-_KITTI_FIELDS = 12  # numbers of a line: the upper three rows of a pose
 _SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's scans
 
 
@@ -115,7 +113,7 @@ class Pairs:
             )
         elif len(self) < _FEW:
             lines.append(f"accuracy is that of {counted(len(self), 'pose')} alone")
-        if self.widest_s > _WIDEST_GAP_S:
+        if self.widest_s > _GAPS_S[1]:
             lines.append(
                 f"true poses are up to {self.widest_s:.3g} s apart, and the path between them is taken as straight"
             )
@@ -137,16 +135,14 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     order = np.argsort(reference.stamps_ns, kind="stable")
     stamps_ns, wanted_ns = reference.stamps_ns[order], estimate.stamps_ns
     interval_ns = _usual_interval_ns(stamps_ns)
-    default_s = min(max(_INTERVALS * 1e-9 * interval_ns, _SHORTEST_GAP_S), _WIDEST_GAP_S)
+    default_s = min(max(_INTERVALS * 1e-9 * interval_ns, _GAPS_S[0]), _GAPS_S[1])
     gap_ns = 1e9 * (default_s if gap_s is None else gap_s)
     index, difference_ns = nearest(wanted_ns, reference.stamps_ns)
     after = np.searchsorted(stamps_ns, wanted_ns, side="right")
     early, late = after == 0, after == len(stamps_ns)
     before, after = np.maximum(after - 1, 0), np.minimum(after, len(stamps_ns) - 1)
     interval = stamps_ns[after] - stamps_ns[before]
-    same_ns, rounded_ns = (
-        min(each * 1e9, _ROUNDING_SHARE * (interval_ns or np.inf)) for each in (_SAME_S, _ROUNDED_S)
-    )
+    same_ns, rounded_ns = (min(each * 1e9, _ROUNDING_SHARE * (interval_ns or np.inf)) for each in _ERRORS_S)
     between = ~early & ~late & (difference_ns > same_ns) & (interval <= gap_ns)
     known = between | (difference_ns <= rounded_ns)
     poses = reference.poses[index]
@@ -285,5 +281,5 @@ def check_overlap(source: str, truth_ns: NDArray[np.int64], scans_ns: NDArray[np
 def read_truth(path: Path) -> TruthFile:
     """Ground truth of a TUM or a KITTI file, by the number of words in its first line."""
     first = next(iter(text_lines(path)), None)
-    is_kitti = first is not None and len(first[1]) == _KITTI_FIELDS
+    is_kitti = first is not None and len(first[1]) == 12  # the upper three rows of a pose
     return TruthFile(path, read_kitti(path) if is_kitti else read_tum(path), not is_kitti)

@@ -11,8 +11,6 @@ from scipy.sparse.linalg import spilu
 from scanchain.data import Integers, Matrix, Vector
 from scanchain.kernels.graph import cholesky, symbolic
 
-_LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
-
 
 class SingularMatrixError(ArithmeticError):
     """A pivot vanished: the equations do not determine the block ``variable``, at ``scalar`` of all scalars."""
@@ -142,10 +140,10 @@ class SparseCholesky:
         """Multiplications of a factorization, roughly: the pivots of every front times its entries."""
         return float((self._fronts.pivots * np.diff(self._fronts.row_start).astype(np.float64) ** 2).sum())
 
-    def factorize(self, values: Vector, lost: float = _LOST_DIGITS) -> None:
+    def factorize(self, values: Vector, lost: float = 1e-13) -> None:
         """Factor the matrix of these block values; raises SingularMatrixError if it is not definite.
 
-        lost : share of its diagonal entry up to which a pivot counts as vanished
+        lost : share of its diagonal entry up to which a pivot counts as vanished, as rounding noise
         """
         self._floor[self._places] = lost * np.abs(values[self.pattern.diagonal])
         if self._factor is None:

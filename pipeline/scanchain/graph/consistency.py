@@ -16,8 +16,6 @@ from scanchain.graph.factors import ORIGIN
 from scanchain.graph.losses import rejection_limit
 from scanchain.graph.problem import GraphProblem
 
-_ROUNDING = 1e-9  # avoids a division by zero for edges that alone connect their poses to the graph
-
 
 class Consistency:
     """Squared Mahalanobis distance between the measurement of edges and their prediction by all other kept edges.
@@ -76,7 +74,8 @@ class Consistency:
 def _distances(e: Matrix, omega: Matrix, P: Matrix, kept: Mask) -> Vector:
     """eᵀ(Ω⁻¹ ∓ P)⁻¹e = eᵀΩ(I ∓ PΩ)⁻¹e, (N,), from residuals (N, m) of edges that are kept or not."""
     sign = np.where(kept, -1.0, 1.0)[:, None, None]
-    matrix = (1.0 + _ROUNDING) * np.eye(e.shape[1]) + sign * (P @ omega)
+    # an edge that alone connects its poses to the graph must not lead to a division by zero
+    matrix = (1.0 + 1e-9) * np.eye(e.shape[1]) + sign * (P @ omega)
     return (e[:, None] @ omega @ np.linalg.solve(matrix, e[..., None]))[:, 0, 0]
 
 
@@ -88,10 +87,9 @@ def is_bent(before: GraphState, after: GraphState, robust_scale: float) -> bool:
     return bool(increase.max() > rejection_limit(robust_scale, k) or increase.mean() > k)
 
 
-FEWEST = 3  # least number of edges of a group; fewer may agree by chance
+FEWEST = 3  # least number of loop edges that support a change of several; fewer may agree by chance
 _REACH = 5  # largest difference between the pose indices of two agreeing edges, at either end
 _MOST = 50  # largest number of edges of a group that is tested as one; larger groups are not
-_AT_ONCE = 10_000  # about the largest number of pairs of edges compared in one call
 
 
 def agreeing_groups(problem: GraphProblem, poses: Matrix, chosen: Mask, limit: float) -> list[Integers]:
@@ -127,7 +125,7 @@ def carried(poses: Matrix, edges: Integers, Z: Matrix, others: Integers) -> Matr
 
 def connected(pairs: Integers, count: int, agree: Callable[..., Mask]) -> list[Integers]:
     """Connected groups, at least ``FEWEST`` of ``count`` items each, by the pairs (P, 2) for which agree(a, b)."""
-    parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
+    parts = np.array_split(pairs, 1 + len(pairs) // 10_000)  # pairs compared in one call
     a, b = pairs[np.concatenate([agree(*part.T) for part in parts])].T
     label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)[1]
     order = np.argsort(label, kind="stable")

@@ -17,8 +17,6 @@ from scanchain.graph.problem import GraphProblem
 from scanchain.kernels.geometry import largest_magnitude
 
 _MOST = 100  # largest number of directions of the null space that are computed
-_MOVES = 1e-6  # share of the largest component of a null vector below which a pose does not move
-_NOTHING = 1e-20  # share of the largest entry up to which a diagonal entry is rounding noise
 _FREE = 1e-11  # share of a diagonal entry of H up to which its pivot in the factorization counts as zero
 _WEAK = 1e-6  # share of the median information up to which an edge is weak
 _LOST = 1e-10  # share of the median information up to which an axis of an edge is lost to rounding in H
@@ -48,7 +46,7 @@ def free_poses(
     values = own_equations(problem, poses, measured[:, :, None] * problem.information * measured[:, None, :])
     diagonal = values[pattern.diagonal]
     largest = diagonal.max(initial=0.0)
-    diagonal[diagonal <= _NOTHING * largest] = 0.0
+    diagonal[diagonal <= 1e-20 * largest] = 0.0  # rounding noise
     prior = np.where(diagonal > 0.0, diagonal, max(largest, 1.0))
     held, vanished = np.zeros(pattern.scalars), list[int]()
     while len(vanished) <= _MOST:
@@ -63,7 +61,8 @@ def free_poses(
     ends = np.zeros((pattern.scalars, len(vanished)))
     ends[vanished, np.arange(len(vanished))] = 1.0
     null = np.abs(problem.packing.unpacked(problem.cholesky.solve(ends)))
-    return names[problem.free[(null > _MOVES * null.max(axis=(0, 1), initial=0.0)).any(axis=(1, 2))]]
+    # a pose with a smaller component does not move
+    return names[problem.free[(null > 1e-6 * null.max(axis=(0, 1), initial=0.0)).any(axis=(1, 2))]]
 
 
 def weakly_joined(edges: Integers, information: Matrix, fixed: Mask) -> Integers:
@@ -97,10 +96,6 @@ def own_equations(problem: GraphProblem, poses: Matrix, information: Matrix) -> 
     return problem.packing.values(blocks)
 
 
-_NO_INFORMATION = 1e-9  # eigenvalue of a matrix scaled to unit diagonal up to which a direction is not measured
-_ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
-
-
 def check_edges(
     edges: Integers, measurements: Matrix, information: Matrix, pose_count: int, *, with_origin: bool = False
 ) -> None:
@@ -131,7 +126,7 @@ def check_edges(
 
 def positive_semidefinite(information: Matrix) -> Mask:
     """True for each of the finite matrices (E, k, k) that is symmetric and positive semidefinite, (E,)."""
-    margin = _ROUNDING * np.abs(information).max(axis=(1, 2), initial=0.0)
+    margin = 1e-6 * np.abs(information).max(axis=(1, 2), initial=0.0)  # of printed digits
     asymmetry = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2), initial=0.0)
     return (asymmetry <= margin) & (np.linalg.eigvalsh(information)[:, 0] >= -margin)
 
@@ -148,7 +143,7 @@ def ranks(information: Matrix) -> Integers:
     diagonal = np.einsum("eaa->ea", information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     correlation = scale[:, :, None] * information * scale[:, None, :]
-    return np.count_nonzero(np.linalg.eigvalsh(correlation) > _NO_INFORMATION, axis=1)
+    return np.count_nonzero(np.linalg.eigvalsh(correlation) > 1e-9, axis=1)  # of unit diagonal
 
 
 def check_connected(edges: Integers, fixed: Mask, names: Integers) -> None:

@@ -10,13 +10,12 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, Integers, Mask, Matrix, Vector
-from scanchain.graph.consistency import apart
+from scanchain.graph.consistency import FEWEST, apart
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks, responses
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.losses import limit_shares, rejection_limit
 from scanchain.graph.minimizer import Minimum
 from scanchain.graph.odometry_errors import (
-    FEWEST,
     Explanation,
     InflatedSegment,
     changed,
@@ -26,20 +25,17 @@ from scanchain.graph.odometry_errors import (
     odometry_of,
     prior,
 )
-from scanchain.graph.optimization import Since, solve
+from scanchain.graph.optimization import LARGE, Since, solve
 from scanchain.graph.problem import GraphProblem
 
-_LARGE = 2000  # odometry edges at or above which groups of loop edges are not judged in trials, only at the end
 _FEWEST = 2  # least number of rejected loop edges, none near another, for which an explanation is searched
-_MAX_STEPS = 20  # largest number of changes of an explanation in one optimization
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
 _MOST_REJECTED = 30  # largest number of rejected loop edges that are evaluated
 _MOST_ENTRIES = 4_000_000  # largest number of entries of the covariances between these and odometry, 32 MB
 _SLIP_LENGTHS = (4, 16, 64)  # numbers of edges of the segments that are tried
 _MOST_SEGMENTS = 100  # largest number of segments that are evaluated without the estimates of the bound
 _CURVATURE = 0.3  # standard deviation of the linearization error of a drift, as a share of the change by it
-_DRIFT_ROUNDS = 3  # rounds, each with a better estimate of that error
-_ROUNDS = 3  # rounds of least squares over the loop edges that an error explains
+_ROUNDS = 3  # of the estimate of that error, and of least squares over the loop edges that an error explains
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +73,7 @@ class Explainer:
             return self._solved(explanation, poses, initialize, since=since)
         best = first = self._solved(explanation, poses, initialize)
         explains = not best.problem.is_sighting.any()
-        for _ in range(_MAX_STEPS):
+        for _ in range(20):
             better = self._better(best) if explains and best.minimum.price else best
             if better is best:
                 break
@@ -141,7 +137,7 @@ class Explainer:
 
     @staticmethod
     def _is_large(explained: Explained) -> bool:
-        return int(explained.problem.is_odometry.sum()) >= _LARGE
+        return int(explained.problem.is_odometry.sum()) >= LARGE
 
     @property
     def _nominal(self) -> float:
@@ -241,7 +237,7 @@ def drift_step(loops: RejectedLoops, sign: Vector, drift: Vector, price: float) 
     A, b, price = curvature + np.diag(own), slope - own * drift, loops.stride * price
     alone = np.asarray(np.linalg.solve(A, b), np.float64)
     fall, change = float(b @ alone) * drift.any(), alone * drift.any()
-    for _ in range(_DRIFT_ROUNDS):
+    for _ in range(_ROUNDS):
         moved = V @ change
         lengths = [np.linalg.norm(part, axis=1) for part in (moved[:, :d], moved[:, d:])]
         sigma = _CURVATURE * np.repeat(np.stack(lengths, axis=1), (d, moved.shape[1] - d), axis=1)

@@ -15,10 +15,8 @@ from scanchain.config import LOSSES
 from scanchain.data import Integers, Mask, Vector
 from scanchain.errors import InputError, one_line
 
-_TRUE_SHARE = 0.999  # share of true loops whose χ² stays below the limit, if the noise model is right
 _SHARP = 1e4  # control above which truncated least squares is replaced by its limit
 _FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is almost convex; its factor there
-_ONE, _SLOPE = 0.99, 1e-3  # least weight at χ² = 0, and largest error of the slope, of a user-defined class
 _FACTOR = 1.4  # ratio of successive controls (Yang et al. 2020, remark 5)
 _MARGIN = 6.0  # safety factor on the price under a pessimistic noise model: residuals have long tails
 _FEWEST = 10  # least number of inlier edges from which a noise model is estimated
@@ -178,7 +176,7 @@ class RobustLoss:
 
 def rejection_limit(scale: float, degrees: int) -> float:
     """χ² above which an edge is an outlier: the kernel's scale², at least the 99.9 % quantile of inliers."""
-    return max(scale**2, 2.0 * float(gammaincinv(0.5 * degrees, _TRUE_SHARE)))
+    return max(scale**2, 2.0 * float(gammaincinv(0.5 * degrees, 0.999)))
 
 
 def limit_shares(scale: float, residuals: Integers, freedom: int) -> Vector:
@@ -220,9 +218,9 @@ def _check(loss: RobustLoss) -> None:
             f"{loss.kernel}: fails for χ² (N,) ({type(error).__name__}: {reason}); wanted weight(self, chi2, s, "
             "mu) and loss(self, chi2, s, mu)"
         ) from error
-    if weight.shape != chi2.shape or not np.all((weight >= 0.0) & (weight <= 1.0)) or weight[0] < _ONE:
+    if weight.shape != chi2.shape or not np.all((weight >= 0.0) & (weight <= 1.0)) or weight[0] < 0.99:
         raise InputError(f"{loss.kernel}: weight returned {weight.tolist()}; wanted (N,) in [0, 1], 1 at χ² = 0")
-    if slope.shape != chi2.shape or not np.allclose(slope, weight, rtol=0.0, atol=_SLOPE):
+    if slope.shape != chi2.shape or not np.allclose(slope, weight, rtol=0.0, atol=1e-3):
         raise InputError(f"{loss.kernel}: the slope of loss over χ² is not weight; both belong to one function")
 
 

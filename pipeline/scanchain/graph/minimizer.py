@@ -126,11 +126,8 @@ class Minimizer:
 
 Optimizer = Literal["gauss-newton", "levenberg-marquardt", "gradient-descent"]
 
-_MOST_DAMPING = 1e12
-_LEAST_DAMPING = 1e-15
-_FIRST_DAMPING = 1e-12  # initial damping, almost Gauss-Newton: weak modes of a long chain have 1e-9 of diag H
+_DAMPING = (1e-15, 1e12)  # least and most
 _GROWTH = 8.0  # factor on the damping after a failed step; it quadruples with each further failure
-_SHORTEST = 1e-12  # share of the model's best step length below which no step is tried
 
 
 class Estimate(Protocol):
@@ -182,7 +179,7 @@ class Damped:
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
         """A step and the estimate after it, with the damping increased until the cost falls."""
-        while self._damping < _MOST_DAMPING:
+        while self._damping < _DAMPING[1]:
             with suppress(SingularMatrixError):
                 step = model.solve(self._damping)
                 to = moved(step)
@@ -190,7 +187,7 @@ class Damped:
                     predicted = float((step * (self._damping * model.diagonal * step - model.gradient)).sum())
                     gain = min((now.cost - to.cost) / max(predicted, 1e-300), 1.0)
                     eased = self._damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
-                    self._damping, self._growth = max(eased, _LEAST_DAMPING), _GROWTH
+                    self._damping, self._growth = max(eased, _DAMPING[0]), _GROWTH
                     return step, to
             self._damping *= self._growth
             self._growth *= 4.0
@@ -206,7 +203,7 @@ class GradientDescent:
         direction, share = -model.gradient / np.maximum(model.diagonal, 1e-300), 1.0
         bent = float(direction @ model.bend(direction))
         step = direction * (-float(direction @ model.gradient) / max(bent, 1e-300))
-        while share > _SHORTEST:
+        while share > 1e-12:  # of the model's best step
             to = moved(share * step)
             if to.cost <= now.cost:
                 return share * step, to
@@ -217,8 +214,8 @@ class GradientDescent:
 StepRule = GaussNewton | Damped | GradientDescent
 
 
-def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
-    """Step rule of this name."""
+def step_rule(optimizer: Optimizer, first_damping: float = 1e-12) -> StepRule:
+    """Step rule of this name; at first almost Gauss-Newton: weak modes of a long chain have 1e-9 of diag H."""
     if optimizer == "levenberg-marquardt":
         return Damped(first_damping)
     return GaussNewton() if optimizer == "gauss-newton" else GradientDescent()

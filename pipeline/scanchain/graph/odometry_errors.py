@@ -8,10 +8,10 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Integers, Mask, Matrix, Vector
+from scanchain.graph.consistency import FEWEST
 
-FEWEST = 3  # least number of rejected loop edges, none near another, that a drift or a jump must explain
-_SCALE_SIGMA, _TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations of the scale and of the turn per meter
-_SLIP_SIGMA_M, _JUMP_SIGMAS = 1.0, (1.0, 0.2)  # standard deviations, m or (m, rad)
+_DRIFT_SIGMAS = (0.03, 0.01)  # prior standard deviations of the scale, and of the turn in rad/m
+_SLIP_SIGMA_M, JUMP_SIGMAS = 1.0, (1.0, 0.2)  # m or (m, rad), standard deviations of an unknown motion
 _SLIP_PROBABILITY, _JUMP_PROBABILITY = 1e-3, 1e-4  # that one begins at an edge
 _WEAKER = 2.0  # ratio of the largest to the least information on a translation at which one direction is weak
 _MOVES = 3.0  # least length of a motion that may slip, in its standard deviations
@@ -144,7 +144,7 @@ def changed(twists: Matrix, drift: Vector, sign: Vector | float) -> Matrix:
 
 def prior(count: int) -> Vector:
     """Prior information (count,) of a drift."""
-    return np.array([_SCALE_SIGMA] + (count - 1) * [_TURN_SIGMA_RAD_M]) ** -2.0
+    return np.array([_DRIFT_SIGMAS[0]] + (count - 1) * [_DRIFT_SIGMAS[1]]) ** -2.0
 
 
 def error_twists(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
@@ -156,7 +156,7 @@ def error_twists(measured: Matrix, information: Matrix, *, is_jump: bool) -> Mat
     """
     count, k = information.shape[:2]
     if is_jump:
-        return np.tile(np.diag(lie.by_component(k, *_JUMP_SIGMAS)), (count, 1, 1))
+        return np.tile(np.diag(lie.by_component(k, *JUMP_SIGMAS)), (count, 1, 1))
     d = measured.shape[-1] - 1
     values, vectors = np.linalg.eigh(information[:, :d, :d])
     motion = measured[:, :d, d]

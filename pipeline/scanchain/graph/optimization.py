@@ -20,10 +20,8 @@ from scanchain.graph.problem import GraphProblem
 
 Rejection = Literal["update", "judge"]
 
+LARGE = 2000  # number of poses from which a graph is not judged as a whole again and again
 _WASTE = 0.1  # share of edges of zero weight above which a new symbolic analysis pays off
-_CRISP = 1e-6  # distance of a weight from 0 or 1 up to which it counts as 0 or 1
-_MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
-_MAX_FAILED = 4  # largest number of groups tried in a row without success
 _FEWER, _FEWEST = 0.3, 1e-3  # factor on the share of changes tried after a round without success; least share
 # a few steps per inlier set, until the poses have roughly settled; the next update continues
 _LIMITS = Limits(max_iterations=3, tolerance=1e-3)
@@ -160,7 +158,7 @@ def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[
     used, focus, final = 0, Focus(minimizer), loss
     for loss in minimizer.graduated(now.chi2, final):
         weights = minimizer.weights(now.chi2, loss)
-        is_crisp = np.isinf(final.control) and np.all((weights < _CRISP) | (weights > 1.0 - _CRISP))
+        is_crisp = np.isinf(final.control) and np.all(np.minimum(weights, 1.0 - weights) < REJECTED_WEIGHT)
         if loss == final or is_crisp:
             break
         minimum = focus.descend(now, loss, Limits(1, 0.0))
@@ -237,7 +235,7 @@ def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: Vector, price
     """
     kept, share = minimum.weights[minimizer.robust] > 0.5, 1.0
     prices = price * minimizer.shares[minimizer.robust]
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(50):
         gain = np.where(kept, against - prices, prices - against)
         if share < _FEWEST or not (gain > 0.0).any():
             break
@@ -260,7 +258,7 @@ def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: 
     """
     tried: set[tuple[int, ...]] = set()
     failed = 0
-    while failed < _MAX_FAILED:
+    while failed < 4:  # in a row
         group = _next_group(minimizer, minimum, price, limit, tried)
         if not len(group):
             break

@@ -9,13 +9,13 @@ from typing import Literal
 from scanchain.config import GraphConfig
 from scanchain.data import GraphState
 from scanchain.graph.losses import rejection_limit
+from scanchain.graph.optimization import LARGE
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.processes import return_freed_memory
 
 _LEAST = 10  # least number of keyframes between two optimizations
 _GROWTH = 0.05  # keyframes, as a share of the poses, until these are judged again, or if no closure moves the map
 LAG = 200  # number of the last poses, which are updated where updating all is too much work
-_LARGE = 2000  # largest number of poses judged together; from this number, live logs are optimized in a thread
 _WORK_PER_KEYFRAME = 1e6  # largest number of multiplications to update all poses, per keyframe since the last time
 _CONTRADICTING = 10.0  # factor on the χ² limit of a loop edge, above which a closure contradicts the graph
 _ADOPTED_AFTER = {"update": 0.005, "judge": 0.1}  # keyframes until a result is adopted, per pose moved
@@ -118,7 +118,7 @@ class Schedule:
             return count
         plan = self._next()
         self.waits, self.moves, self.optimized_at = False, False, count
-        if is_live and count >= _LARGE and plan != self._of_end:
+        if is_live and count >= LARGE and plan != self._of_end:
             self._begin_waiting(plan)
             due = count + max(int(_ADOPTED_AFTER[plan.rejection] * (count - plan.first)), _LEAST)
             self.background = BackgroundOptimization(self.graph, self.config, plan, due)
@@ -167,14 +167,14 @@ class Schedule:
         if self.background is not None:
             return self._of_end
         if self.excess:
-            first = 0 if self._size <= _LARGE else max(self.agreed_at - LAG, count - _LARGE)
+            first = 0 if self._size <= LARGE else max(self.agreed_at - LAG, count - LARGE)
             if not first or count - self.judged_at >= _GROWTH * (count - first):
                 return Plan(first, "judge")
         is_affordable = count - self.updated_at >= self.graph.work / _WORK_PER_KEYFRAME
         return Plan(0, "update") if is_affordable else self._of_end
 
     def _carry_out(self, plan: Plan) -> None:
-        if len(self.graph) - plan.first >= _LARGE:
+        if len(self.graph) - plan.first >= LARGE:
             return_freed_memory()
         plan.carry_out(self.graph, self.config)
         self._begin_waiting(plan)

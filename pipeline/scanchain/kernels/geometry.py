@@ -7,7 +7,6 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 _BLOCK = 512  # entries per block that are compared with the largest value so far
-_SMALL = 1e-8  # sine of half the angle, below which the series is exact
 
 
 @njit()
@@ -185,7 +184,7 @@ def twist_3d(T, out):
     _quaternion(T, out[:4])
     x, y, z = out[0], out[1], out[2]
     norm = math.sqrt(x * x + y * y + z * z)
-    scale = 2.0 if norm < _SMALL else 2.0 * math.atan2(norm, out[3]) / norm
+    scale = 2.0 if norm < 1e-8 else 2.0 * math.atan2(norm, out[3]) / norm  # the series is exact
     x, y, z = scale * x, scale * y, scale * z
     u, v, w = T[0, 3], T[1, 3], T[2, 3]
     e = second_coefficient(x * x + y * y + z * z)

@@ -6,9 +6,6 @@ import numpy as np
 
 from scanchain.kernels.compiling import njit
 
-_SWEEPS = 30  # largest number of sweeps of rotations; a few suffice
-_BESIDE = 1e-16  # largest off-diagonal entry of a converged matrix, as a share of the diagonal
-
 
 @njit(inline="always")
 def normal_2d(cxx: float, cxy: float, cyy: float):
@@ -72,11 +69,11 @@ def eigensystem(A, values, vectors):
     for i in range(k):
         for j in range(k):
             vectors[i, j] = 1.0 if i == j else 0.0
-    for _ in range(_SWEEPS):
+    for _ in range(30):  # of rotations; a few suffice
         beside = 0.0
         for p in range(k - 1):
             for q in range(p + 1, k):
-                if abs(A[p, q]) > _BESIDE * math.sqrt(abs(A[p, p] * A[q, q])):
+                if abs(A[p, q]) > 1e-16 * math.sqrt(abs(A[p, p] * A[q, q])):
                     beside = 1.0
                     _rotate_pair(A, vectors, p, q)
         if beside == 0.0:

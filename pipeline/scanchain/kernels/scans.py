@@ -8,7 +8,6 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import between, inverse, perturb
 from scanchain.kernels.voxels import EMPTY, find, first_slot, pack
 
-_MOST_STEPS = 100.0  # of 1 rad per sweep; no lidar turns faster
 _TERMS = 9  # of the power series in the squared angle, up to 1 rad
 _INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(2 * _TERMS + 3))
 _BLOCK = 2048  # points whose keys are computed together, in a loop that the compiler vectorizes
@@ -108,7 +107,7 @@ def deskew_in_space(points, shares, twist):
     flat, x, y, z = points.reshape(-1), twist[3], twist[4], twist[5]
     square = x * x + y * y + z * z
     longest = np.abs(shares).max() if shares.size else 0.0
-    steps = int(np.ceil(min(max(np.sqrt(square) * longest, 1.0), _MOST_STEPS)))
+    steps = int(np.ceil(min(max(np.sqrt(square) * longest, 1.0), 100.0)))  # no lidar turns by 100 rad per sweep
     ru, rv, rw = twist[0], twist[1], twist[2]
     for _ in range(steps):
         for i in range(shares.shape[0]):

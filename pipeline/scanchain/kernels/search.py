@@ -7,15 +7,21 @@ single shift comes first: no remaining one can beat it.
 
 import heapq
 import math
+from enum import IntEnum
 
 import numpy as np
 
 from scanchain.kernels.compiling import njit
 
-SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2  # score of a point in a cell
 APART_RAD = 0.1  # least angle between two distinct poses
 _EARLY = 32  # points between two checks whether the rest can still reach the least score
 TURNS = 3  # headings scored together: a point at the median range moves by one cell from one to the next
+
+
+class Score(IntEnum):
+    """Score of a point in a cell."""
+
+    SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2
 
 
 @njit(nogil=True)
@@ -179,8 +185,8 @@ def _score(layer, cells, x: int, y: int, least: float) -> int:
         column, row = cells[i, 0] + x, cells[i, 1] + y
         if 0 <= row < layer.shape[0] and 0 <= column < layer.shape[1]:
             total += layer[row, column]
-        if i % _EARLY == _EARLY - 1 and total + SURFACE * (count - 1 - i) < least:
-            return SURFACE * -count - 1
+        if i % _EARLY == _EARLY - 1 and total + Score.SURFACE * (count - 1 - i) < least:
+            return Score.SURFACE * -count - 1
     return total
 
 

@@ -8,6 +8,7 @@ along both directions. Its row of ``history`` holds the ticks of the first and o
 number of points when the shape was fitted. A 2D map is the plane z = 0 of the same layout.
 """
 
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -21,15 +22,25 @@ _OFFSET = 1 << 20
 _LIMIT = (1 << 21) - 1
 REACH = float(_OFFSET - 64)  # voxels around any point, within which keys are unique
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
-DIRECTION, SHAPE, THICKNESS, ACROSS = 3, 6, 7, 8
-MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
-CELL = 16  # two more than are used, to fill the second cache line
-BORN, SEEN, FITTED = 0, 1, 2
+CELL = 16  # columns of a cell, two more than are used, to fill the second cache line
 _GROWN = 1.3  # factor by which the points of a voxel must grow to refit it
 _FILLED = 2.5  # voxel size, in σ of a range, at which the mean is as far off the surface as the points
 _BROAD = 0.125  # least width, in voxels, of a plane fitted to a voxel's own points alone
 _BLOCK = 256  # points whose voxels are looked up together
 MANY = 30.0  # number of points above which more add no information, since their poses share errors
+
+
+class Cell(IntEnum):
+    """Columns of ``cells``, after the mean."""
+
+    DIRECTION, SHAPE, THICKNESS, ACROSS = 3, 6, 7, 8
+    MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
+
+
+class History(IntEnum):
+    """Columns of ``history``."""
+
+    BORN, SEEN, FITTED = 0, 1, 2
 
 
 class Voxels(NamedTuple):
@@ -66,22 +77,20 @@ def insert(voxels, points, T, tick: int, alone: float, variance: float):
         for i in range(part.shape[0]):
             if i == 0 or keys[i] != keys[i - 1]:
                 voxel = rows[i] if rows[i] >= 0 else _voxel_at(voxels, keys[i], tick)
-                if voxels.history[voxel, SEEN] != tick:
-                    voxels.history[voxel, SEEN] = tick
+                if voxels.history[voxel, History.SEEN] != tick:
+                    voxels.history[voxel, History.SEEN] = tick
                     touched[touches] = voxel
                     touches += 1
             (ix, iy, iz), size = unpack(voxels.keys[voxel]), voxels.size_m
-            x, y, z = (
-                moved[i, 0] - (ix + 0.5) * size,
-                moved[i, 1] - (iy + 0.5) * size,
-                moved[i, 2] - (iz + 0.5) * size,
-            )
+            x = moved[i, 0] - (ix + 0.5) * size
+            y = moved[i, 1] - (iy + 0.5) * size
+            z = moved[i, 2] - (iz + 0.5) * size
             add_moments(voxels.moments, voxel, x, y, z)
     for k in range(touches):
         voxel = touched[k]
-        if voxels.moments[voxel, 0] >= _GROWN * voxels.history[voxel, FITTED]:
+        if voxels.moments[voxel, 0] >= _GROWN * voxels.history[voxel, History.FITTED]:
             _fit(voxels, voxel, points.shape[1], alone, variance, sums)
-            voxels.history[voxel, FITTED] = np.int32(voxels.moments[voxel, 0])
+            voxels.history[voxel, History.FITTED] = np.int32(voxels.moments[voxel, 0])
 
 
 @njit(nogil=True)
@@ -123,8 +132,8 @@ def shape_of(cells, voxel: int):
     Returned as numbers: passing a row of ``cells`` would cost reference counting at every point.
     """
     q = cells[voxel, 0], cells[voxel, 1], cells[voxel, 2]
-    normal = cells[voxel, DIRECTION], cells[voxel, DIRECTION + 1], cells[voxel, DIRECTION + 2]
-    return cells[voxel, SHAPE], q, normal
+    normal = cells[voxel, Cell.DIRECTION], cells[voxel, Cell.DIRECTION + 1], cells[voxel, Cell.DIRECTION + 2]
+    return cells[voxel, Cell.SHAPE], q, normal
 
 
 @njit(nogil=True)
@@ -132,7 +141,7 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
     """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
     for voxel in range(voxels.used[0]):
         dx, dy, dz = voxels.cells[voxel, 0] - x, voxels.cells[voxel, 1] - y, voxels.cells[voxel, 2] - z
-        is_old = voxels.history[voxel, SEEN] < oldest_tick
+        is_old = voxels.history[voxel, History.SEEN] < oldest_tick
         if is_old or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
             continue
         new = _voxel_at(kept, voxels.keys[voxel], 0)
@@ -160,7 +169,8 @@ def _voxel_at(voxels, key: int, tick: int) -> int:
     voxels.keys[voxel] = key
     voxels.moments[voxel].fill(0.0)
     voxels.cells[voxel].fill(0.0)
-    voxels.history[voxel, BORN], voxels.history[voxel, SEEN], voxels.history[voxel, FITTED] = tick, -1, 0
+    history = voxels.history[voxel]
+    history[History.BORN], history[History.SEEN], history[History.FITTED] = tick, -1, 0
     return voxel
 
 
@@ -205,17 +215,15 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums
     if width2 < (_BROAD * size) ** 2:
         _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
         _fit_shape(sums, dimension, variance, cell)
-        if variance > 0.0 and cell[SHAPE] == PLANE:
-            x, y, z = (
-                sums[1] / sums[0] - m[1] / m[0],
-                sums[2] / sums[0] - m[2] / m[0],
-                sums[3] / sums[0] - m[3] / m[0],
-            )
-            along = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
+        if variance > 0.0 and cell[Cell.SHAPE] == PLANE:
+            x = sums[1] / sums[0] - m[1] / m[0]
+            y = sums[2] / sums[0] - m[2] / m[0]
+            z = sums[3] / sums[0] - m[3] / m[0]
+            along = cell[Cell.DIRECTION] * x + cell[Cell.DIRECTION + 1] * y + cell[Cell.DIRECTION + 2] * z
             of_mean = variance / m[0] + variance * (_FILLED * _FILLED * variance / (size * size)) ** 2
-            along *= of_mean / (of_mean + max(cell[THICKNESS] - variance, 0.0))
+            along *= of_mean / (of_mean + max(cell[Cell.THICKNESS] - variance, 0.0))
             for axis in range(3):
-                cell[axis] += along * cell[DIRECTION + axis]
+                cell[axis] += along * cell[Cell.DIRECTION + axis]
 
 
 @njit(inline="always")
@@ -252,17 +260,17 @@ def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
 @njit(inline="always")
 def _fit_2d(m, noise: float, cell):
     """Normal of the points where they lie along a line, by the eigenvalues of their covariance less the noise."""
-    cell[SHAPE] = POINT
+    cell[Cell.SHAPE] = POINT
     n = m[0]
     if n < 3.0:
         return 0.0
     xx, xy, _, yy, _, _ = covariance_of(m)
     small, large, nx, ny = normal_2d(xx, xy, yy)
     if large > 1e-12 and small - noise < 0.1 * (large - noise):
-        cell[SHAPE] = PLANE
-        cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
-        cell[THICKNESS], cell[MEAN_TERM] = max(small, 0.0), 1.0 / min(n, MANY)
-        cell[SLOPE_ALONG] = cell[MEAN_TERM] / large
+        cell[Cell.SHAPE] = PLANE
+        cell[Cell.DIRECTION], cell[Cell.DIRECTION + 1] = nx, ny
+        cell[Cell.THICKNESS], cell[Cell.MEAN_TERM] = max(small, 0.0), 1.0 / min(n, MANY)
+        cell[Cell.SLOPE_ALONG] = cell[Cell.MEAN_TERM] / large
     return large - noise
 
 
@@ -273,30 +281,30 @@ def _fit_3d(m, noise: float, cell):
     A plane is thin relative to its second extent, a line relative to its length in both others. For points on one
     line, rounding can make the first two negative.
     """
-    cell[SHAPE] = POINT
+    cell[Cell.SHAPE] = POINT
     n = m[0]
     if n < 5.0:
         return 0.0
     xx, xy, xz, yy, yz, zz = covariance_of(m)
     small, middle, large = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
     if middle > 0.0 and small - noise < 0.1 * max(middle - noise, 0.0):
-        cell[SHAPE] = PLANE
+        cell[Cell.SHAPE] = PLANE
         chosen = small
         wx, wy, wz = eigenvector_3d(xx, xy, xz, yy, yz, zz, middle)
-        cell[ACROSS], cell[ACROSS + 1], cell[ACROSS + 2] = wx, wy, wz
+        cell[Cell.ACROSS], cell[Cell.ACROSS + 1], cell[Cell.ACROSS + 2] = wx, wy, wz
         n = min(n, MANY)
-        cell[THICKNESS], cell[MEAN_TERM] = max(small, 0.0), 1.0 / n
-        cell[SLOPE_ACROSS], cell[SLOPE_ALONG] = 1.0 / (n * middle), 1.0 / (n * large)
+        cell[Cell.THICKNESS], cell[Cell.MEAN_TERM] = max(small, 0.0), 1.0 / n
+        cell[Cell.SLOPE_ACROSS], cell[Cell.SLOPE_ALONG] = 1.0 / (n * middle), 1.0 / (n * large)
     elif middle - noise < 0.1 * (large - noise):
-        cell[SHAPE] = LINE
+        cell[Cell.SHAPE] = LINE
         chosen = large
-        cell[THICKNESS] = max(middle, 0.0)
+        cell[Cell.THICKNESS] = max(middle, 0.0)
     else:
         return middle - noise
     vx, vy, vz = eigenvector_3d(xx, xy, xz, yy, yz, zz, chosen)
-    cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2] = vx, vy, vz
+    cell[Cell.DIRECTION], cell[Cell.DIRECTION + 1], cell[Cell.DIRECTION + 2] = vx, vy, vz
     if vx == 0.0 and vy == 0.0 and vz == 0.0:
-        cell[SHAPE] = POINT
+        cell[Cell.SHAPE] = POINT
     return middle - noise
 
 

@@ -8,18 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanchain.config import LogConfig, PreprocessConfig
-from scanchain.data import MOST_COPIES, RawPoints, Scan
+from scanchain.data import FEWEST_COPIED, MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError, counted, duration
 from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.publishers import Publisher
 
 _MOST_REPEATED = 0.5  # share of repeated stamps above which they are a warning, not a note
-_FEWEST_COPIED = 10  # smallest number of points of a copy; fewer can be equal by chance
 _COPIES_SHARE = 0.01  # share of copies among the scans above which they are a warning, not a note
 _MOST_RATE = 50.0  # ratio of two clock rates above which their units differ: by 1000, less gaps
-_AGAIN = 0.1  # distance from the first stamp, as a share of the jump, below which the recording restarted
-_SAMPLE = 64  # points compared first; in most scans they decide, which saves time
 
 
 @dataclass(slots=True)
@@ -71,7 +68,7 @@ def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
 def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
     """Reason for which preprocessing retains none of the points (N, d); empty where it retains one."""
     low_m, high_m = config.min_range_m, config.max_range_m
-    if any(low_m <= math.hypot(*point) <= high_m for point in points[::_SAMPLE].tolist()):
+    if any(low_m <= math.hypot(*point) <= high_m for point in points[::64].tolist()):
         return ""
     squares = np.einsum("ij,ij->i", points, points, dtype=np.float64)
     if ((low_m * low_m <= squares) & (squares <= high_m * high_m)).any():
@@ -120,10 +117,11 @@ class ScanCounts:
 
     def repeats(self, points: RawPoints) -> bool:
         """True if the points of a scan are bitwise identical to those of the previous one."""
-        if self._last is None or len(points) < _FEWEST_COPIED:
+        if self._last is None or len(points) < FEWEST_COPIED:
             return False
         last = self._last.points
-        return np.array_equal(points[:_SAMPLE], last[:_SAMPLE]) and np.array_equal(points, last)
+        # the first points decide in most scans, which saves time
+        return np.array_equal(points[:64], last[:64]) and np.array_equal(points, last)
 
     def add(self, scan: Scan) -> None:
         """Count a scan that is used."""
@@ -147,7 +145,8 @@ class ScanCounts:
     def _jump(self, scan: Scan, last: Scan) -> str:
         """Jump of the stamps at a scan: its size, where it is, and its likely cause."""
         cause = "a clock that was set, or a playback that skipped a part"
-        if abs(scan.stamp_ns - self.begin_ns) < _AGAIN * abs(last.stamp_ns - scan.stamp_ns):
+        # back near the first stamp
+        if abs(scan.stamp_ns - self.begin_ns) < 0.1 * abs(last.stamp_ns - scan.stamp_ns):
             cause = "a recording played in a loop, or a simulation that restarted"
         elif scan.clock_jump_s < 0.0:
             cause = "a clock that was set back, or an older recording"

@@ -27,14 +27,11 @@ from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
 _GAP_PERIODS = 2.5  # longest time between scans, in periods, that is not a gap
-_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0  # longest gap over which the motion is predicted reliably
-_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # scan duration over period outside which a time unit is implausible
+_LONG_GAP_S = (0.5, 10.0)  # longest gap over which the motion is predicted reliably, and with wheels
+_PARTS = (0.3, 1.2)  # scan duration over period outside which a time unit is implausible
 _FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
-_LEAST_STEP_M = 1e-3  # distance between two wheel readings above which the robot moves
 _MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
-_STUCK_SHARE = 0.01  # share of beams at the farthest range above which it is reported
 _FEW_POINTS = 50  # number of returns below which matches are weak
-_SAME_M = 1e-4  # largest difference of ranges that count as equal: rounding of float32
 
 
 class Severity(StrEnum):
@@ -140,7 +137,7 @@ class Survey:
         if scan.fixes is not None:
             self.fixes.append(scan.fixes)
         ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
-        at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M))
+        at_farthest = int(np.count_nonzero(ranges_m > ranges_m[-1] - 1e-4))  # rounding of float32
         percentiles_m = ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)]
         span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan
         counts, farthest_m = (len(ranges_m), scan.dropped), round(float(ranges_m[-1]), 4)
@@ -197,7 +194,7 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     longest_s, at_s = steps_s[longest], seen.log_time_s(longest)
     found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, {at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
-    if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
+    if longest_s < _LONG_GAP_S[is_on_wheels]:
         return Finding("gaps", Severity.NOTE, found, effect)
     effect += (
         "; after a long gap a match may converge to a wrong pose: run the part before, as below, and the rest, "
@@ -255,7 +252,7 @@ def _wheel_speed_m_s(seen: Survey) -> float:
     stamps_ns, order = np.unique([stamp_ns for stamp_ns, _ in seen.wheels], return_index=True)
     positions = np.array([seen.wheels[k][1] for k in order])
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    moving = steps_m > _LEAST_STEP_M
+    moving = steps_m > 1e-3  # m
     return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
 
 
@@ -313,7 +310,7 @@ def _point_times(seen: Survey) -> Finding:
     assumed = times.assumed.removeprefix("point times").lstrip(": ") or "time_increment of the beams"
     found = f"{assumed}; a scan lasts {1e3 * span_s:.4g} ms"
     part = span_s / seen.period_s if seen.period_s else 1.0
-    if is_scan(seen.log.lidar) or _PART_OF_SCAN < part < _MORE_THAN_SCAN:
+    if is_scan(seen.log.lidar) or _PARTS[0] < part < _PARTS[1]:
         grade = Severity.WARNING if untimed else Severity.NOTE if faults else Severity.OK
         effect = f"{counted(untimed, 'scan')} without: {distorted}" if untimed else "the rest is used"
         return Finding("point times", grade, "; ".join([found, *faults]), effect if faults else "")
@@ -331,9 +328,9 @@ def _other_unit(assumed: str, part: float) -> str:
     if not current:
         return ""
     for unit, unit_s in UNITS_S.items():
-        if unit != current and _PART_OF_SCAN < part * unit_s / UNITS_S[current] < _MORE_THAN_SCAN:
+        if unit != current and _PARTS[0] < part * unit_s / UNITS_S[current] < _PARTS[1]:
             return f"--log.point_times {unit}"
-    return "--log.point_times none" if part > _MORE_THAN_SCAN else ""
+    return "--log.point_times none" if part > _PARTS[1] else ""
 
 
 def _damage(seen: Survey, preprocess: PreprocessConfig, most_bad: float) -> Finding:
@@ -391,7 +388,7 @@ def _no_return(seen: Survey) -> Finding:
     farthest_m = max(values)
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.valid + scan.invalid for scan in seen.scans), 1)
-    if share < _STUCK_SHARE:
+    if share < 0.01:
         return Finding("no return", Severity.OK, "no range is so frequent that it would indicate no return")
     found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest range"
     effect = "if it indicates no return, it is matched like a wall that moves along"

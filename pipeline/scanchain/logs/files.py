@@ -21,10 +21,7 @@ from scanchain.files import ATTEMPTS, SILENCE_S, Address, Source
 
 T = TypeVar("T")
 _PAUSE_S = 0.5  # pause after the first failure; twice as long after each further one
-_CONNECT_S = 10.0  # longest time until a server answers
 _ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
-
-_BLOCK_BYTES = 8_000_000  # size of the requests of a download
 
 
 class RemoteFile:
@@ -88,7 +85,7 @@ def _system_of(address: Address) -> tuple[Any, str]:
         from fsspec.core import url_to_fs
     except ImportError as error:
         raise MissingExtraError(str(error.name).partition(".")[0], "remote") from None
-    silence = ClientTimeout(total=None, sock_connect=_CONNECT_S, sock_read=SILENCE_S)  # a large file takes long
+    silence = ClientTimeout(total=None, sock_connect=10.0, sock_read=SILENCE_S)  # a large file takes long
     is_web = address.url.lower().startswith(("http://", "https://"))
     try:
         return url_to_fs(address.url, **({"client_kwargs": {"timeout": silence}} if is_web else {}))
@@ -139,8 +136,8 @@ def fetch_whole(file: RemoteFile) -> Path:
             fetch(file.address.url, copy)
             return copy
         with copy.open("wb") as written:  # block by block: a broken connection costs one block only
-            for offset in range(0, file.size, _BLOCK_BYTES):
-                written.write(file.read(offset, min(_BLOCK_BYTES, file.size - offset)))
+            for offset in range(0, file.size, 8_000_000):
+                written.write(file.read(offset, min(8_000_000, file.size - offset)))
     except OSError as error:
         raise InputError(
             f"{copy}: {file.address} cannot be stored there ({error.strerror}); set TMPDIR"

@@ -25,7 +25,6 @@ _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # largest difference of transforms that count as equal
 TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar above which its scans are not a floor plan
-_TURNED_DEG = 0.5  # smallest rotation of a lidar on its robot that is reported
 
 
 class Mounting(NamedTuple):
@@ -342,7 +341,7 @@ def turned_by(T_base_lidar: Pose) -> str:
     pitch_rad = np.arcsin(np.clip(-T[2, 0], -1.0, 1.0))
     angles_deg = np.degrees([np.arctan2(T[2, 1], T[2, 2]), pitch_rad, lie.yaw(T)]).tolist()
     angles = zip(("roll", "pitch", "yaw"), angles_deg, strict=True)
-    return ", ".join(f"{name} {angle:.0f} deg" for name, angle in angles if abs(angle) > _TURNED_DEG)
+    return ", ".join(f"{name} {angle:.0f} deg" for name, angle in angles if abs(angle) > 0.5)
 
 
 def place_text(T: Pose) -> str:

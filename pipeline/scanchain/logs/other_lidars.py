@@ -16,13 +16,7 @@ from scanchain.config import LogConfig
 from scanchain.data import OtherPoints, Pose
 from scanchain.errors import InputError, counted, duration
 from scanchain.logs.index import Channel, Decoded, FileIndex, name_of
-from scanchain.logs.messages.lidar import (
-    Returns,
-    decode_cloud,
-    decode_laser_scan,
-    plane_height_m,
-    with_offsets,
-)
+from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m, with_offsets
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 from scanchain.logs.messages.readers import is_scan, reader
 from scanchain.logs.mounting import place_text, stated_poses
@@ -30,7 +24,6 @@ from scanchain.logs.publishers import Publishers, in_first_frame
 from scanchain.logs.samples import HOLD_SCANS, NEAREST_NS
 from scanchain.logs.stream import sampled_messages
 
-_SAMPLED = 16  # number of messages per block that are sampled to find frames and clock
 _TOGETHER_NS = 125_000_000  # longest time between a point and the middle of the scan it is added to
 _WAITING_NS = 2_000_000_000  # longest time between points that wait: the first lidar is missing, or a clock jumped
 _ABSENT = 2.5  # time without a lidar, in usual intervals between scans with it, above which it is missing
@@ -79,7 +72,7 @@ class OtherLidar:
         own = {"point_times": unit, "every": 1, "elevation_offset_rad": 0.0, "range_offset_m": 0.0}
         self.channel, self.config = lidar, replace(config, **own)
         decode = decoder(lidar, PointTimes(self.config), None)
-        sampled = list(sampled_messages(indexes, lidar.topic, decode, most=_SAMPLED))
+        sampled = list(sampled_messages(indexes, lidar.topic, decode, most=16))
         self.plane_m = None if is_scan(lidar) else plane_height_m(each.value for each in sampled)
         offsets_ns = [each.value.stamp_ns - each.log_time_ns for each in sampled]
         of_first_ns = [offset_ns for _, offset_ns in first.offsets_ns]

@@ -18,7 +18,6 @@ from scanchain.logs.mounting import TILTED_RAD, place_text, tilt_rad
 _STEP_NS, _STEP_PERIODS = 1_000_000_000, 5  # largest step of a clock by jitter (0.9 s in Intel), and in periods
 _SAMPLED = 16, 128  # number of messages that are sampled to find the publishers: clouds, planar scans
 _STEADY = 3  # number of scans before and after a jump that must agree with each other
-_COMPARED = 31  # number of scans before a step that it is compared with
 _TOGETHER_NS = 250_000_000  # longest time between scans of several lidars that are matched together
 
 
@@ -135,7 +134,7 @@ def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tupl
     A step back, or a step ahead that the log times do not show, is a jump if the next scans' offsets from log time
     to stamp have all shifted too: single wrong stamps, jitter and late messages are not jumps.
     """
-    before: deque[tuple[int, int]] = deque(maxlen=_COMPARED)
+    before: deque[tuple[int, int]] = deque(maxlen=31)  # that a step is compared with
     waiting: deque[tuple[Decoded, Pose | None]] = deque()
     rest = iter(messages)
     while first := waiting.popleft() if waiting else next(rest, None):

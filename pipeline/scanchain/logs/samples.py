@@ -19,7 +19,6 @@ from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.logs.mounting import Sensor
 
-_RETAINED = 4096  # samples in memory: of 2 s and more at 2000 Hz
 NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and, with its delay added, that a scan waits
 HOLD_SCANS = 32  # largest number of scans that wait for samples, or for points of other lidars; limits memory
 
@@ -59,7 +58,7 @@ class SampleStream(Generic[S]):
         if sample.stamp_ns not in self._samples:
             insort(self._stamps_ns, sample.stamp_ns)
         self._samples[sample.stamp_ns] = sample
-        if len(self._stamps_ns) > _RETAINED:
+        if len(self._stamps_ns) > 4096:  # 2 s and more at 2000 Hz
             del self._samples[self._stamps_ns.pop(0)]
 
     def covers(self, stamp_ns: int) -> bool:

@@ -15,7 +15,6 @@ from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 
 # limits chosen with the lidars of tests/logs/test_sectors.py
-_SAMPLE = 250  # number of evenly spaced points of a message that determine its direction and width
 _TURN_RAD = 2.0 * np.pi
 _WIDEST_RAD = 4.0 / 3.0 * np.pi  # angular width of a message above which it is a sweep by itself
 _FEWEST = 3  # number of messages after which a lidar that always faces one direction is recognized
@@ -71,7 +70,7 @@ def find_sectors(sample: Iterable[Returns], point_times: str) -> Sectors | None:
             continue
         seen.append(returns)
         directions_rad.append(_direction(points))
-        turned_rad = _wrapped(_azimuth(points[:: len(points) // _SAMPLE + 1]) - directions_rad[-1])
+        turned_rad = _wrapped(_azimuth(points[:: len(points) // 250 + 1]) - directions_rad[-1])  # evenly spaced
         widths_rad.append(float(np.ptp(np.percentile(turned_rad, (5.0, 95.0)))) / 0.9)
         steps_rad = np.abs(_wrapped(np.diff(directions_rad)))
         is_one_way = len(seen) == _FEWEST and np.median(widths_rad) > _WIDTHS[1] * np.median(steps_rad)
@@ -245,7 +244,7 @@ def _azimuth(points: RawPoints) -> NDArray[np.float32]:
 
 def _direction(points: RawPoints) -> float:
     """Mean azimuth of points (N, d), from a sample of them."""
-    x, y = points[:: len(points) // _SAMPLE + 1, :2].T
+    x, y = points[:: len(points) // 250 + 1, :2].T
     ranges_m = np.maximum(np.hypot(x, y), np.finfo(np.float32).tiny)
     return float(np.arctan2((y / ranges_m).sum(), (x / ranges_m).sum()))
 

@@ -56,9 +56,6 @@ class Span(NamedTuple):
 
 
 _LONG_GAP_NS = 60_000_000_000  # longest time without any message that is not reported
-_LONGEST_GAP_NS = 86_400_000_000_000  # longest time between two files of one log: a day
-_BLOCKS_AHEAD = 4  # largest number of decoded blocks that wait, twice as many of a remote log
-_MOST_BYTES_AHEAD = 256_000_000  # largest decompressed size of the blocks that wait; limits memory
 
 EVERYTHING = Span(0, (1 << 64) - 1)
 
@@ -112,7 +109,7 @@ def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
     }
     for before, after in _long_gaps(indexes, config, scanned):
         gap_ns = after.start_ns - before.end_ns
-        if before.file != after.file and gap_ns > _LONGEST_GAP_NS:
+        if before.file != after.file and gap_ns > 86_400_000_000_000:  # a day
             raise InputError(
                 f"{indexes[before.file].path} ends {duration(1e-9 * gap_ns)} before {indexes[after.file].path} "
                 "begins, so they are not parts of one log; run each separately, or all with scanchain batch"
@@ -245,11 +242,12 @@ Decoders = Mapping[str, Callable[[memoryview], object]]
 
 
 def decoded_messages(
-    indexes: Sequence[FileIndex], decoders: Decoders, span: Span, *, damage: list[str], ahead: int = _BLOCKS_AHEAD
+    indexes: Sequence[FileIndex], decoders: Decoders, span: Span, *, damage: list[str], ahead: int = 4
 ) -> Iterator[Decoded]:
     """Messages of the topics that have a decoder, by log time; at equal times in the order of the files.
 
-    ahead : largest number of decoded blocks that wait; damage : extended by what is skipped
+    ahead : largest number of decoded blocks that wait, twice as many of a remote log
+    damage : extended by what is skipped
     """
     wanted = [index.numbers_of(*decoders) for index in indexes]
 
@@ -312,7 +310,7 @@ def _ahead(
                 running.append((block, pool.submit(decode, block)))
                 size += block.uncompressed_size
             while len(running) > (0 if block is None else ahead) or (
-                size > _MOST_BYTES_AHEAD and len(running) > 1
+                size > 256_000_000 and len(running) > 1  # limits memory
             ):
                 done, future = running.popleft()
                 size -= done.uncompressed_size

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.data import DOWNWEIGHTED
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.growing_array import GrowingArray
 from scanchain.kernels.graph.paths import path_lengths
 
-_MIN_WEIGHT = 0.5  # robust weight of a loop edge above which it connects its keyframes
 _LOOP_LENGTH_M = 1e-3  # length of a loop edge in the shortest path: it adds next to no drift
 
 
@@ -51,7 +51,7 @@ class Segments:
         segment = np.repeat(np.arange(count), np.diff([*self.starts, len(graph)]))
         if count == 1:
             return segment
-        ends = segment[graph.edges[graph.is_loop & (graph.weight > _MIN_WEIGHT)]]
+        ends = segment[graph.edges[graph.is_loop & (graph.weight > DOWNWEIGHTED)]]
         number = np.arange(count)
         for pair in np.unique(ends[:, 0] * count + ends[:, 1]).tolist():
             i, j = divmod(pair, count)
@@ -93,7 +93,7 @@ class Drift:
     def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:
         """Uncertainty (K,) of each keyframe of the graph relative to one of them, meters, at most the limit."""
         self.measure(graph)
-        is_open = ~graph.is_loop | (graph.weight > _MIN_WEIGHT)
+        is_open = ~graph.is_loop | (graph.weight > DOWNWEIGHTED)
         lengths = np.where(is_open, self.lengths.rows, np.inf)
         meters = path_lengths(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
         meters[graph.held] = meters[graph.held].min(initial=np.inf)  # they do not drift relative to each other

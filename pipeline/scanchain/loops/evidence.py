@@ -13,10 +13,10 @@ from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Proposal
 from scanchain.kernels.free_space import compare_ranges, nearest_ranges
 from scanchain.loops.connectivity import Segments
+from scanchain.loops.verification import MARGIN_SHARE
 
 _NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes whose free space is compared
-_BINS = 360  # of azimuth, 1°; as fine in elevation
-_MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, plus that share of them
+_MARGIN_M = {2: 0.3, 3: 1.0}  # by which ranges may differ, plus a share of them
 _IN_SIGHT = 0.3  # least share of a keyframe's points in view of the map's nearest one for it to be in sight
 _RISK = 1e-3  # probability that an accepted pose is wrong
 _REJECTED = -3.0  # log-odds at or below which a pose is rejected
@@ -31,7 +31,7 @@ _NO_OVERLAP = 0.3  # overlap above which a match is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of points in view of the other keyframe for which the comparison counts in full
 _LATEST = 10  # number of last counted keyframes on which the next one may depend
 _INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path beyond which two keyframes are independent, at full scale
-_AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
+_AGREE = (1.0, 0.1)  # m at full scale and rad, largest difference between the poses that two closures imply
 
 
 def compared(
@@ -42,7 +42,7 @@ def compared(
     min_path_m : least path between the two
     """
     d = viewers[0].T_odom_lidar.shape[0] - 1
-    ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
+    ranges_m = np.empty((1 if d == 2 else 180, 360))  # by elevation and azimuth: 1°
     positions = np.array([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
     traveled_m = np.array([keyframe.traveled_m for keyframe in viewed])
     counts = np.zeros(2, np.int64)
@@ -56,7 +56,7 @@ def compared(
             for T_odom_viewer, seen in viewer.views(viewer.T_odom_lidar):
                 nearest_ranges(lie.lift_points(seen), ranges_m)
                 T_viewer_viewed = lie.lift(lie.between(T_odom_viewer, other.T_odom_lidar))
-                counts += compare_ranges(points, T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE)
+                counts += compare_ranges(points, T_viewer_viewed, ranges_m, margin_m, MARGIN_SHARE)
     return counts
 
 
@@ -233,9 +233,8 @@ class SequentialPlaceTest:
 
     def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
         """True if a closure implies the same pose of its source as the first waiting one."""
-        poses = (pose_by(each, closure.source, keyframes, T_world) for each in (self.waiting[0], closure))
-        off_m, off_rad = lie.apart(*poses)
-        return off_m < _AGREE_M * keyframes[closure.source].scale and off_rad < _AGREE_RAD
+        T, T_other = (pose_by(each, closure.source, keyframes, T_world) for each in (self.waiting[0], closure))
+        return lie.agree(T, T_other, _AGREE[0] * keyframes[closure.source].scale, _AGREE[1])
 
 
 def log_ratio(closure: Closure, agreeing: int, contradicting: int, points: int) -> float:

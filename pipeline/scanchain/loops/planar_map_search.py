@@ -14,7 +14,7 @@ from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.config import MapsConfig
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal
-from scanchain.kernels.search import FREE, NEAR, UNKNOWN
+from scanchain.kernels.search import Score
 from scanchain.loops.evidence import rank_of
 from scanchain.loops.place_search import Underway, candidates, completed
 from scanchain.loops.submaps import VoxelSubmaps, seen_together
@@ -22,28 +22,25 @@ from scanchain.loops.verification import Verifier
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
 from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
-from scanchain.registration.search import Search, draw_surfaces
+from scanchain.registration.search import POINTS, Search, draw_surfaces
 
 # of the newest keyframes in older ones, within the drift
-_RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of uncertainty
-_MIN_RAD = 0.1  # least half width of the window in heading
+_HEADING = (0.1, 0.2)  # rad and rad/m, half width of the window in heading: at least, and by the uncertainty
 _WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # a second answer means ambiguity
 
 # of a path in a whole map
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
 _CERTAIN = 0.6  # log-odds of occupancy above which a cell is a surface, and below minus which it is free
-_POINTS, _MORE_POINTS = 120, 800  # number of points that poses are searched with and compared with
-_APART_M, _APART_RAD = 1.0, 0.2  # least distance of two distinct poses
-_ANSWERS = 12  # largest number of poses that are compared
-_RIVAL = 0.75  # share of the best score above which a pose elsewhere makes it ambiguous
-LEAST_SHARE = 0.35  # of the highest possible score: wrong poses of long paths reach it
-_CHANCE = 2.0  # over the root of the number of points: share above LEAST_SHARE that is reached by chance
+_MORE_POINTS = 800  # number of points that poses are compared with
+_IN_MAP = Wanted(apart_m=1.0, rival=0.75, answers=12, least=0.35)  # a rival means ambiguity
+_APART_RAD = 0.2  # least angle of two distinct poses
+_CHANCE = 2.0  # over the root of the number of points: share above the least that is reached by chance
 _CERTAINLY = 0.06  # least share above these for a location to count as found
 _CLEAR_M = 2.0  # least path since an ambiguous search for a location to count as found
-_PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
+PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 
 # of the scans of a path that was found
-_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest distance of an aligned scan from where its path was found
+AGREE = (0.5, 0.1)  # m and rad, largest distance of an aligned scan from where its path was found
 _SOURCES, _SUBMAPS = 8, 6  # keyframes of the path that are aligned, about 1 m apart, and submaps tried for each
 _NEAR_M = 8.0  # largest distance of such a submap's anchor
 
@@ -67,7 +64,7 @@ class Hypothesis:
 
     @property
     def _by_chance(self) -> float:
-        return LEAST_SHARE + _CHANCE / math.sqrt(self.points)
+        return _IN_MAP.least + _CHANCE / math.sqrt(self.points)
 
     @property
     def is_certain(self) -> bool:
@@ -77,7 +74,7 @@ class Hypothesis:
     @property
     def is_ambiguous(self) -> bool:
         """True if the points fit nearly as well elsewhere."""
-        return self.rival > _RIVAL * self.share
+        return self.rival > _IN_MAP.rival * self.share
 
 
 class PlanarMapSearch:
@@ -101,18 +98,18 @@ class PlanarMapSearch:
         grid.insert_batch(T_map_lidar, np.vstack(clouds), np.append(0, np.cumsum([len(each) for each in clouds])))
         grid = grid.trimmed()
         log_odds = np.pad(grid.log_odds, 1)
-        cells = np.where(log_odds < -_CERTAIN, FREE, UNKNOWN).astype(np.int8)
+        cells = np.where(log_odds < -_CERTAIN, Score.FREE, Score.UNKNOWN).astype(np.int8)
         draw_surfaces(cells, *np.nonzero(log_odds > _CERTAIN))
-        room = (cells == FREE) | (cells == NEAR)
+        room = (cells == Score.FREE) | (cells == Score.NEAR)
         self.grid = SearchGrid(cells, grid.origin_m - self.resolution_m, self.resolution_m, room)
 
-    def sought(self, points: Points, least: float = LEAST_SHARE) -> Generator[None, None, Hypothesis | None]:
+    def sought(self, points: Points, least: float = _IN_MAP.least) -> Generator[None, None, Hypothesis | None]:
         """The pose that the points (N, 2), lidar frame, fit best; None if none has the least share.
 
         Poses are searched with some of the points, in slices of equal work; those found are compared with more.
         """
         points = np.random.default_rng(0).permutation(downsample(points, self.resolution_m))
-        search = Search(points[:_POINTS], self.grid, None, Wanted(_APART_M, _RIVAL, _ANSWERS, least))
+        search = Search(points[:POINTS], self.grid, None, _IN_MAP._replace(least=least))
         more, step_rad = points[:_MORE_POINTS].copy(), 0.5 * search.turn_rad
         found = yield from candidates(search, lambda T: [self.grid.climbed(more, T, step_rad)])
         if not found:
@@ -188,7 +185,7 @@ class PlanarFinder:
         )
         surfaces = downsample(seen_together(placed, lie.identity(2)), size_m)
         points = thinned(seen_together(path, lie.inverse(newest.T_odom_lidar)), size_m)
-        window = Window(T_world[-1], radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
+        window = Window(T_world[-1], radius_m, _HEADING[0] + _HEADING[1] * radius_m)
         found = find(points, SearchGrid.of_points(surfaces, size_m), window, _WANTED)
         return self.aligned(newest, found[0].T_target_source, anchors, old) if len(found) == 1 else None
 
@@ -206,10 +203,11 @@ class PlanarFinder:
             T_first = lie.between(anchor.T_odom_lidar, T_world_source)
             submap = self.submaps.around(anchor.index, keyframes, len(keyframes) - 1)
             verified = self.verifier.scan(source, submap, T_first)
-            off_m, off_rad = lie.apart(T_first, verified.match.T_target_source)
-            is_off = off_m > _AGREE_M or off_rad > _AGREE_RAD
-            far = Problem("far from where the path was found", f"{off_m:.1f} m from where the path was found")
-            closure = verified.closure(anchor.index, source.index, Proposal.PLACE, problem=far if is_off else None)
+            off_m, problem = lie.apart(T_first, verified.match.T_target_source)[0], None
+            if not lie.agree(T_first, verified.match.T_target_source, *AGREE):
+                where = "from where the path was found"
+                problem = Problem(f"far {where}", f"{off_m:.1f} m {where}")
+            closure = verified.closure(anchor.index, source.index, Proposal.PLACE, problem=problem)
             if best is None or (rank_of(closure) > rank_of(best)):
                 best = closure
         return best
@@ -218,12 +216,12 @@ class PlanarFinder:
 def _are_apart(T: Pose, T_other: Pose) -> bool:
     """True for two distinct poses."""
     away_m = np.abs(T[:2, 2] - T_other[:2, 2]).max()
-    return bool(away_m >= _APART_M or lie.apart(T, T_other)[1] >= _APART_RAD)
+    return bool(away_m >= _IN_MAP.apart_m or lie.apart(T, T_other)[1] >= _APART_RAD)
 
 
 def _path_begin(keyframes: Sequence[Keyframe], start: int) -> int:
     """The first keyframe, from ``start`` on, of the path whose points are searched for."""
     first = len(keyframes) - 1
-    while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= _PATH_M:
+    while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= PATH_M:
         first -= 1
     return first

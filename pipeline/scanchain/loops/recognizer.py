@@ -18,7 +18,7 @@ from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, VoxelSubm
 from scanchain.loops.verification import Verification, Verifier
 
 RECOGNIZERS = {"outline": "scanchain.loops.upright_search:OutlineRecognizer"}
-_PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
+PLACE_DRIFT = 0.1  # largest error of the position by odometry, as a share of the path between
 _PLACE_SIGMAS = 3.0  # the same in standard deviations of the prediction by the graph, where these allow more
 _SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps along the path
 
@@ -270,7 +270,7 @@ class PlaceCloser:
         moved = lie.inverse(T_world_j) @ T_world_i @ verified.match.T_target_source
         moved_m = float(np.linalg.norm(moved[:-1, -1]))
         traveled_m = anchor.traveled_m - query.keyframes[candidate.target].traveled_m
-        if moved_m <= max(_PLACE_DRIFT * traveled_m, limits.min_radius_m):
+        if moved_m <= max(PLACE_DRIFT * traveled_m, limits.min_radius_m):
             return None
         d = self.dimension
         covariance = graph.relative_covariance(candidate.target, anchor.index)[:d, :d]
@@ -279,6 +279,6 @@ class PlaceCloser:
             return None
         return Problem(
             "far from the prediction",
-            f"{moved_m:.1f} m from the prediction, more than {100.0 * _PLACE_DRIFT:g} % of the path between and "
+            f"{moved_m:.1f} m from the prediction, more than {100.0 * PLACE_DRIFT:g} % of the path between and "
             f"more than {_PLACE_SIGMAS:g} standard deviations ({sigma_m:.1f} m)",
         )

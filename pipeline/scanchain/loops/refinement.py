@@ -18,7 +18,6 @@ from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
 from scanchain.threads import threads
 
-_TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # step below which another iteration would change little
 _MAX_SCANS = 2048  # largest number of scans per thread in memory
 
 
@@ -61,7 +60,7 @@ def refined(
         each[:, :2, 2] -= origin_m
     surfaces, least_share = _map_of(T_world_keyframes, keyframes, config), config.matching.min_inlier_share
     settings = settings_of(config.matching, surfaces, wide=False)
-    settings = settings._replace(reach=1, last_reach=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD)
+    settings = settings._replace(reach=1, last_reach=1, tolerance_m=0.005, tolerance_rad=0.002)
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
     prior = np.diag(sigma**-2.0) * settings.variance
 

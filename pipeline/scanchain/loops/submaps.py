@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Points, Pose
-from scanchain.kernels.voxels import DIRECTION, PLANE, SHAPE
+from scanchain.kernels.voxels import PLANE, Cell
 from scanchain.loops.connectivity import Segments
 from scanchain.registration import VoxelMap
 
@@ -22,7 +22,6 @@ RADII_AHEAD = 1.0  # radii of the trajectory after the anchor that a submap take
 RADII_BEHIND = 2.0  # radii of the trajectory before it: a lidar that looks ahead sees a location from far off
 _MAX_POINTS = 80_000  # largest number of points of a submap, from keyframes evenly spread over it
 _OF_MAP = 2  # factor on the number of keyframes in a submap of a map, which was seen from several sides
-_MAX_CACHED = 64  # largest number of voxel submaps in memory; the least recently used one is dropped first
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
 _MIN_GROUND_VOXELS = 10  # least number of voxels with such a normal; with fewer the lidar is assumed upright
 
@@ -102,17 +101,17 @@ class VoxelSubmaps:
             last = -1
         submap = self.cached.pop((anchor, last), None)
         if submap is None:
-            chosen = self._nearest(keyframes[anchor]) if is_of_map else range(first, last + 1)
+            chosen: Sequence[int] = range(first, last + 1)
+            if is_of_map:
+                count = min(_OF_MAP * (2 * self.half_width + 1), self.of_map.n)
+                nearest = self.of_map.query(keyframes[anchor].T_odom_lidar[:-1, -1], count)[1]
+                chosen = sorted(np.atleast_1d(nearest).tolist())
             submap = self._build(keyframes[anchor], [keyframes[index] for index in chosen], is_of_map)
             submap.compact()
         self.cached[anchor, last] = submap
-        if len(self.cached) > _MAX_CACHED:
-            self.cached.popitem(last=False)
+        if len(self.cached) > 64:
+            self.cached.popitem(last=False)  # the least recently used one
         return submap
-
-    def _nearest(self, anchor: Keyframe) -> list[int]:
-        count = min(_OF_MAP * (2 * self.half_width + 1), self.of_map.n)
-        return sorted(np.atleast_1d(self.of_map.query(anchor.T_odom_lidar[:-1, -1], count)[1]).tolist())
 
     def _build(self, anchor: Keyframe, members: Sequence[Keyframe], is_of_map: bool) -> VoxelMap:
         """The submap; of a 3D map, of all points together: every voxel is fitted once, and all are equally old."""
@@ -135,7 +134,7 @@ def level_frame(keyframe: Keyframe, config: LocalMapConfig) -> Pose:
     voxels = VoxelMap(3, config, keyframe.scale, keyframe.noise_m)
     voxels.insert(keyframe.points, lie.identity(3))
     cells = voxels.voxels.cells[: len(voxels)]
-    normals = cells[cells[:, SHAPE] == PLANE, DIRECTION : DIRECTION + 3]
+    normals = cells[cells[:, Cell.SHAPE] == PLANE, Cell.DIRECTION : Cell.DIRECTION + 3]
     up = np.array([0.0, 0.0, 1.0])
     for cosine in _CONES:
         along = normals @ up

@@ -19,7 +19,7 @@ from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Po
 from scanchain.errors import InputError
 from scanchain.files import write_whole
 from scanchain.loops.place_search import Underway, candidates, completed
-from scanchain.loops.recognizer import Candidate, Query
+from scanchain.loops.recognizer import PLACE_DRIFT, Candidate, Query
 from scanchain.loops.submaps import Submap, level_frame, seen_together, upright_frame
 from scanchain.loops.verification import Verifier
 from scanchain.maps.saved_map import read_arrays
@@ -27,24 +27,22 @@ from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, Search, evenly, upright_columns
 
 # of every search
-_COLUMNS, _MIN_COLUMNS = 150, 30  # numbers of columns that are scored, evenly spread, and least for a search
+_COLUMNS = (30, 150)  # least number of columns for a search, and most that are scored, evenly spread
 _APART = 4.0  # least distance of two distinct poses, cells
 _REFINED_RAD = 0.15  # half width in heading of the window around a coarse pose in which it is refined
 
 # of a submap in older ones, within the drift
-_REACH, _HEADING_RAD = 0.1, 0.5  # largest error of odometry: position, as a share of the path between, and heading
+_HEADING_RAD = 0.5  # largest error of the heading of odometry
 _MAX_REACH_M, _MAX_WIDE = 1000.0, 800  # half width of the window, and cells along it; beyond, cells grow
-_MIN_SHARE = 0.4  # least share of the columns that lie on older ones: half is hidden from the other side
-_RIVAL, _POSES = 0.9, 8  # share of the best score above which another pose is a rival, and most that are compared
 _MIN_APART = 0.25  # least distance in radii of a submap between a pose and its rival
-_TARGETS, _VERIFIED = 8, 8  # largest number of older submaps that a pose is refined in, and of those verified
+_MOST = 8  # largest number of older submaps that a pose is refined in, and of those verified
 _REFINED = 3.0  # half width of the window of refinement, cells
 _TOUCHING = 1.5  # cells, within which a column lies on another one
 
 # of keyframes in a whole map
-MEMBERS = 10  # number of the newest keyframes that are searched for together
+MEMBERS = 10  # number of keyframes whose points are combined; over more, drift would make ground look upright
 _RADIUS = 1.5  # radii of a submap up to which structure around the lidar is used
-_COARSE, _COARSE_COLUMNS, _COARSE_POSES = 2.0, 100, 12  # coarse search: cell size in fine cells, largest numbers
+_COARSE, _COARSE_COLUMNS = 2.0, 100  # of the coarse search: cell size in fine cells, largest number of columns
 _MAX_CELLS = 1 << 21  # of the coarse grid of a map; a larger one has coarser cells
 _MIN_SHARE_IN_MAP = 0.55  # least share of the columns that lie on the map's
 _RIVAL_IN_MAP, _POSES_IN_MAP = 0.85, 4  # share of the best score above which a pose is verified, too; most of them
@@ -52,12 +50,11 @@ _PER_SCAN = 3  # number of poses that are verified per scan
 _MIN_AGREEMENT = 0.8  # least free-space agreement with a map of another day: cars and people differ
 _REACH_IN_MAP = 0.5  # radii of a submap from the map's keyframes, beyond which nothing is verified
 _LEVEL_M, _MAX_LEVELS = 2.0, 3  # least difference in height of two stories, and number of them that are tried
-_AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two closures imply
+_AGREE = (1.0, 0.05)  # m and rad, largest difference between the poses that two closures imply
 _AMBIGUOUS = Problem.plain("another location in the map is as similar")
 
 # of the outline of a map
 PLACES_FILE, VERSION = "places.npz", 1
-_TOGETHER = 10  # number of keyframes whose points are combined; over more, drift would make ground look upright
 _MAX_LEVELED = 16  # number of keyframes, evenly spread, whose ground gives the map's vertical
 
 
@@ -99,11 +96,11 @@ class OutlineRecognizer:
         newest, keyframes, limits = self.outlines[-1], query.keyframes, self.config.loops
         here, radius_m = query.submap.anchor, query.submap.radius_m
         old = [each for each in self.outlines if keyframes[each.anchor].traveled_m <= query.max_traveled_m]
-        if not old or len(newest.columns) < _MIN_COLUMNS:
+        if not old or len(newest.columns) < _COLUMNS[0]:
             return []
         T_old, T_expected = _in_plane(old, newest, query)
         path_m = here.traveled_m - np.array([keyframes[each.anchor].traveled_m for each in old])
-        reach_m = np.clip(_REACH * path_m, limits.min_radius_m, _MAX_REACH_M)
+        reach_m = np.clip(PLACE_DRIFT * path_m, limits.min_radius_m, _MAX_REACH_M)
         near = np.flatnonzero(_away_m(T_old, T_expected) <= reach_m + radius_m)
         if not len(near):
             return []
@@ -111,15 +108,16 @@ class OutlineRecognizer:
         size_m = max(fine_m, 2.0 * within_m / _MAX_WIDE)
         combined = np.vstack([lie.transform(T_old[k], old[k].columns) for k in near.tolist()])
         window = Window(T_expected, within_m, _HEADING_RAD)
-        wanted = Wanted(_APART * size_m, _RIVAL, _POSES, _MIN_SHARE)
-        found = find(evenly(newest.columns, _COLUMNS), SearchGrid.of_points(combined, size_m), window, wanted)
+        # half of the columns is hidden from the other side
+        wanted = Wanted(apart_m=_APART * size_m, rival=0.9, answers=8, least=0.4)
+        found = find(evenly(newest.columns, _COLUMNS[1]), SearchGrid.of_points(combined, size_m), window, wanted)
         poses = np.array([each.T_target_source for each in found]).reshape(-1, 3, 3)
         candidates: list[Candidate] = []
         for T in poses:
             adjacent = near[_away_m(T_old[near], T) <= radius_m].tolist()
             T_targets = {k: lie.between(T_old[k], T) for k in adjacent}
             touching = {k: _touching(newest.columns, old[k], T_targets[k], size_m) for k in adjacent}
-            for k in sorted(adjacent, key=lambda k: -touching[k])[:_TARGETS]:
+            for k in sorted(adjacent, key=lambda k: -touching[k])[:_MOST]:
                 drift_m = float(np.clip(limits.drift * path_m[k], limits.min_radius_m, limits.max_radius_m))
                 by, rival = Proposal.POSITION, -1
                 if _away_m(T, T_expected) > drift_m:
@@ -130,7 +128,7 @@ class OutlineRecognizer:
                     T_level = old[k].T_anchor_level @ lie.lift(fit.T_target_source)
                     T_target_source = T_level @ lie.inverse(newest.T_anchor_level)
                     candidates.append(Candidate(old[k].anchor, T_target_source, fit.share, by, rival))
-        return sorted(candidates, key=lambda each: -each.score)[:_VERIFIED]
+        return sorted(candidates, key=lambda each: -each.score)[:_MOST]
 
 
 def _in_plane(old: Sequence[SubmapOutline], newest: SubmapOutline, query: Query) -> tuple[Matrix, Pose]:
@@ -199,8 +197,7 @@ class UprightMap:
         if not accepted:
             return tried[0][0] if tried else None
         best, T_best = max(accepted, key=lambda each: each[0].overlap)
-        off_m, off_rad = np.array([lie.apart(T_best, T) for _, T in accepted]).T
-        return best if (off_m < _AGREE_M).all() and (off_rad < _AGREE_RAD).all() else best.rejected(_AMBIGUOUS)
+        return best if all(lie.agree(T_best, T, *_AGREE) for _, T in accepted) else best.rejected(_AMBIGUOUS)
 
     def is_repeated(self, members: Sequence[Keyframe]) -> bool:
         """True if the structure around some keyframes is found at several locations in the map."""
@@ -210,13 +207,13 @@ class UprightMap:
     def seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
         """The best poses (3, 3) of points in the level frame of the map, from a coarse search, then refined."""
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
-        columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
-        if len(columns) < _MIN_COLUMNS or not len(self.columns):
+        columns = evenly(upright_columns(near, self.size_m), _COLUMNS[1])
+        if len(columns) < _COLUMNS[0] or not len(self.columns):
             return ()
         if self.grid is None:
             self.grid = self._rasterized()
         coarse_m = self.grid.resolution_m
-        wanted = Wanted(_APART * coarse_m, _RIVAL_IN_MAP, _COARSE_POSES, _MIN_SHARE_IN_MAP)
+        wanted = Wanted(apart_m=_APART * coarse_m, rival=_RIVAL_IN_MAP, answers=12, least=_MIN_SHARE_IN_MAP)
         reach_m = 2.0 * _RADIUS * self.radius_m + coarse_m
 
         def refine(T: Pose) -> Sequence[Found]:
@@ -333,8 +330,8 @@ def level_of(keyframes: Sequence[Keyframe], poses: Sequence[Pose] | Matrix, conf
 def _columns(keyframes: Sequence[Keyframe], T_level_map: Pose, size_m: float) -> Matrix:
     """Upright columns (M, 2), one per cell."""
     seen: list[NDArray[np.float64]] = []
-    for first in range(0, len(keyframes), _TOGETHER):
-        members = keyframes[first : first + _TOGETHER]
+    for first in range(0, len(keyframes), MEMBERS):
+        members = keyframes[first : first + MEMBERS]
         seen.append(upright_columns(seen_together(members, T_level_map), size_m))
     columns = np.vstack(seen)
     return columns[np.unique(np.floor(columns / size_m), axis=0, return_index=True)[1]]
@@ -346,4 +343,4 @@ def _refined(
     """The pose of columns (N, 2) near a coarse one that fits other columns (M, 2) best; empty if none fits."""
     around = Window(T, half_width_m, _REFINED_RAD)
     wanted = Wanted(_APART * size_m, 1.0, 1, least)
-    return find(evenly(columns, _COLUMNS), SearchGrid.of_points(surfaces, size_m), around, wanted)
+    return find(evenly(columns, _COLUMNS[1]), SearchGrid.of_points(surfaces, size_m), around, wanted)

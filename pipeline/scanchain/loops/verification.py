@@ -25,8 +25,7 @@ _MIN_AGREEMENT = 0.87  # least agreement about free space, relative to that of e
 _COARSE = 2.0  # voxel size of the first alignment of two submaps, in usual voxel sizes
 _VIEWS = 8  # number of views of each submap that are compared with the other
 _VERIFIED = "verified by matching"
-_BINS = (90, 180)  # bins of elevation and azimuth: 2° each
-_MARGIN_SHARE = 0.05  # least difference of two ranges that contradict each other, as a share of the range
+MARGIN_SHARE = 0.05  # least difference of two ranges that contradict each other, as a share of the range
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +155,12 @@ def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, 
 
     points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 if no point is in view.
     """
-    ranges_m, points = np.empty(_BINS), np.ascontiguousarray(points)
+    ranges_m, points = np.empty((90, 180)), np.ascontiguousarray(points)  # by elevation and azimuth: 2°
     agreeing = contradicting = 0
     for T_target_lidar, seen in submap.views(_VIEWS):
         nearest_ranges(np.ascontiguousarray(seen), ranges_m)
         T_lidar_source = lie.between(T_target_lidar, T_target_source)
-        yes, no = compare_ranges(points, T_lidar_source, ranges_m, margin_m, _MARGIN_SHARE)
+        yes, no = compare_ranges(points, T_lidar_source, ranges_m, margin_m, MARGIN_SHARE)
         agreeing, contradicting = agreeing + yes, contradicting + no
     return agreeing / max(agreeing + contradicting, 1) if agreeing + contradicting else 1.0
 

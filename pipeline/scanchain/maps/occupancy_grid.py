@@ -17,10 +17,9 @@ OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
 FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown
 MAX_CELLS = 64_000_000  # largest number of cells: half a gigabyte
 
-_HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, sec. 5.1
-_LOW, _HIGH = -2.0, 3.5
+# log-odds of a hit (0.7) and a miss (0.4), and their limits (0.12 and 0.97): Hornung et al. 2013, sec. 5.1
+_LOG_ODDS = (0.85, -0.4, -2.0, 3.5)
 _MARGIN = 2  # cells around all beams; rounding may shift a beam by one cell
-_LARGEST = 1e300  # m², of squared ranges
 _GROWTH = 0.25  # share of the extent that is added where the grid has to grow
 
 
@@ -61,8 +60,8 @@ class OccupancyGrid:
             corners = [(each.min(axis=0), each.max(axis=0)) for each in (starts, ends)]
             self._cover(np.concatenate([np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))]))
             kernels.draw_beams(
-                starts, ends, kept, self.origin_m, self.resolution_m, self.scans + 1, np.float32(_HIT),
-                np.float32(_MISS), np.float32(_LOW), np.float32(_HIGH), self.log_odds, self.drawn,
+                starts, ends, kept, self.origin_m, self.resolution_m, self.scans + 1, *map(np.float32, _LOG_ODDS),
+                self.log_odds, self.drawn,
             )  # fmt: skip
         self.scans += len(poses)
 
@@ -73,7 +72,7 @@ class OccupancyGrid:
         the lidar's height, it starts where it enters the slice: at the share limit / z of its length.
         """
         squares = sum(column * column for column in points.T)
-        points = points[squares <= min(self.config.grid_max_range_m**2, _LARGEST)]
+        points = points[squares <= min(self.config.grid_max_range_m**2, 1e300)]
         moved = np.asarray(sum(T[:-1, axis] * points[:, axis, None] for axis in range(points.shape[1])))
         share = 0.0
         if points.shape[1] == 3:

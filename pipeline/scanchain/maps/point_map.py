@@ -19,14 +19,12 @@ from scanchain.kernels.voxels import EMPTY
 from scanchain.threads import threads
 
 MAX_VOXELS = 16_000_000  # largest number of voxels: a gigabyte
-_FIRST_VOXELS = 1 << 14
 
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
 _REACH_BINS = 1.5  # width of a bin in voxels at the farthest range that a scan is used to
-_CUBES_TO_REACH = 8.0  # number of cubes along the reach, by which points are sorted
 _WINDOW = 0.6  # share of a scan's spacing, within which a surface has a point
 _RANGE_MARGIN_SHARE = 0.03  # share of a range by which two may differ, plus one voxel
-_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # assumed flatness of the ground in voxels, error of an elevation
+_LEVEL = (0.5, 0.005)  # assumed flatness of the ground in voxels, and error of an elevation
 _LEAST_THROUGH = 2  # least number of scans that saw through what moved
 _MAJORITY = 1.5  # least ratio of scans that saw through to scans that saw a surface there
 _ENOUGH = 12  # number of scans that saw a surface for which it is retained
@@ -46,7 +44,7 @@ class PointMap:
         self.voxel_size_m = voxel_size_m
         self.max_voxels = max_voxels
         self.center_m = np.zeros(3)
-        self._allocate(min(_FIRST_VOXELS, max_voxels))
+        self._allocate(min(1 << 14, max_voxels))
 
     def __len__(self) -> int:
         return self.used
@@ -157,7 +155,7 @@ def sightings(
             T_lidar_world, spans = lie.inverse(T_world_lidar), index.within_reach(T_world_lidar[:3, 3])
             limits = np.array([
                 index.reach_m, max(_WINDOW * view.spacing_m, voxel_size_m), voxel_size_m, _RANGE_MARGIN_SHARE,
-                _LEVEL_VOXELS * voxel_size_m, _LEVEL_SHARE,
+                _LEVEL[0] * voxel_size_m, _LEVEL[1],
             ])  # fmt: skip
             parts = [
                 pool.submit(
@@ -177,7 +175,7 @@ class _Cells:
 
     def __init__(self, points: Points, reach_m: float) -> None:
         self.reach_m = reach_m
-        self.edge_m = reach_m / _CUBES_TO_REACH
+        self.edge_m = reach_m / 8.0  # of cubes, by which points are sorted
         cubes = np.floor(points / self.edge_m)
         self.order = np.lexsort(cubes.T)
         self.points, cubes = points[self.order], cubes[self.order]

@@ -10,12 +10,13 @@ import numpy as np
 from scanchain.data import GRAVITY_M_S2, LEAST_FIT, Match, Matrix, Pose, RestForce, Vector, unit_of
 from scanchain.odometry.gyro import Gyro
 
-_FEWEST, _RECENT = 15, 20  # motions whose errors decide whether the accelerometer is used
-_BETTER, _WORSE = 0.9, 1.5  # ratio of squared errors below which it is used, and above which no longer
+_MOTIONS = (15, 20)  # least and most whose errors decide whether the accelerometer is used
+_RATIO = (0.9, 1.5)  # of its squared errors to those of the last motion, below which it comes, and stays, in use
 _DETERMINED = 0.5  # least information of a match about the position, as a share of the largest of one direction
 _UNKNOWN_M_S = 1.0  # σ of the velocity above which it is not used
 _POSITION_M = 0.003  # least σ of a match
-_VELOCITY_M_S, _GRAVITY_M_S2, _BIAS_M_S2 = 40.0, 1.0, 0.05  # σ at first: any car, tilted axes, MEMS
+FASTEST_M_S = 40.0  # of any car whose speed is unknown
+_GRAVITY_M_S2, _BIAS_M_S2 = 1.0, 0.05  # σ at first: tilted axes, MEMS
 _TURNED = 2.0  # σ of the turn of gravity in the drifting odometry frame, in differences of gyro and match
 _WALK = 0.001  # random walk of the bias: m/s² per √s
 _NOISE_RAD = 0.001  # σ of the rotation of a match, by which gravity appears as an acceleration
@@ -61,7 +62,7 @@ class Accelerometer:
         self.last_m, self.innovation = np.zeros(3), math.nan  # innovation of the last match; normalized
         self.last_C = np.zeros((3, 3))  # of the last match
         self.of_prediction = self.of_match = 1.0  # factors on variances
-        self.errors: deque[tuple[float, float]] = deque(maxlen=_RECENT)  # squared, in σ²: ours, of the last motion
+        self.errors: deque[tuple[float, float]] = deque(maxlen=_MOTIONS[1])  # ours and the last motion's, σ²
         self.squares, self.compared = np.zeros(2), 0  # sums of all of them in m²
         self.scans, self.used = 0, 0
         self.unit_m_s2, self.defect = 1.0, ""
@@ -190,7 +191,7 @@ class Accelerometer:
         self.x = np.zeros(12)
         self.x[_P] = T_odom_last[:3, 3] + R_odom @ self.p_lidar_imu
         self.x[_G] = -self.unit_m_s2 * R_odom @ mean
-        self.P = np.diag(np.repeat([_POSITION_M, _VELOCITY_M_S, _GRAVITY_M_S2, _BIAS_M_S2], 3) ** 2)
+        self.P = np.diag(np.repeat([_POSITION_M, FASTEST_M_S, _GRAVITY_M_S2, _BIAS_M_S2], 3) ** 2)
         self.of_prediction = self.of_match = 1.0
         return True
 
@@ -209,9 +210,9 @@ class Accelerometer:
         self.errors.append((float(ours @ weight @ ours), float(others @ weight @ others)))
         self.squares += ours @ ours, others @ others
         self.compared += 1
-        if len(self.errors) >= _FEWEST:
+        if len(self.errors) >= _MOTIONS[0]:
             of_ours, of_others = map(sum, zip(*self.errors, strict=True))
-            self.is_trusted = of_ours < (_WORSE if self.is_trusted else _BETTER) * of_others
+            self.is_trusted = of_ours < _RATIO[self.is_trusted] * of_others
 
     def _adapt(self, square: float, *, persists: bool) -> None:
         """Adapt the factors on variances to a squared innovation, in σ², which has the last one's sign or not."""

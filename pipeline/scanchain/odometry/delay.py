@@ -12,7 +12,7 @@ _DELAYS_S = np.linspace(-1.0, 1.0, 101)  # of the wheels' stamps against those o
 MOST_DELAY_S = float(_DELAYS_S[-1])
 APART_S, _ODDS = 0.1, 10.0  # distinct delays, and least log-likelihood ratio against any other
 _BLOCK, FEWEST = 300, 30  # scans that are compared together; least number of motions
-_LONGEST_S = 0.5  # time between two scans whose motion is compared
+LONGEST_S = 0.5  # time between two scans whose motion is compared
 
 
 def correlations(measured: Matrix, by_scans: Vector, known: Mask) -> Vector:
@@ -124,7 +124,7 @@ class WheelDelay:
         lidar, base, known = lidar[first], base[first], known[first]
         path = WheelPath(times_s, base if base.shape[-1] == 3 else lie.flatten(base))
         ends_s = np.column_stack([times_s[:-1], times_s[1:]])
-        chosen = known[:-1] & known[1:] & (np.diff(times_s) < _LONGEST_S) & path.covers(ends_s)
+        chosen = known[:-1] & known[1:] & (np.diff(times_s) < LONGEST_S) & path.covers(ends_s)
         if np.count_nonzero(chosen) < FEWEST:
             return np.zeros(len(_DELAYS_S))
         return path.odds(ends_s[chosen], lie.between(lidar[:-1], lidar[1:])[chosen])

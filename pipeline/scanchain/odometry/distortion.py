@@ -23,7 +23,7 @@ from scanchain.settings import load_settings
 _AT = (0.5, 0.25, 0.75, 0.0, 1.0, 0.375, 0.625)  # positions of windows in the log, in the order tried
 _ENOUGH, _MOST, _SCANS = 3, 5, 16  # windows with motion: enough if significant, at most; scans each
 _BEGIN, _BLOCK = 4, 3  # first scans of a window, skipped while its map is small; scans per residual block
-_POINTS, _MATCHED = 8_000, 500  # points per scan, sampled at random, and points per scan to match
+_POINTS = 8_000  # points per scan, sampled at random
 _LEAST_M = 0.03  # distortion of a scan below which range noise hides it
 _CLEAR = 3.5  # standard errors above which a mean is significant: for 12 values by chance in 1 of 400
 _LEAST_GAIN = 0.01  # least relative decrease of the residuals for times to be adopted
@@ -116,7 +116,7 @@ def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
     of_given : whether to test times that the log has, too; else None for such a log
     """
     config, rng, mounting = load_settings(log.dimension).config, np.random.default_rng(0), log.stated_mounting
-    preprocess = msgspec.structs.replace(config.preprocess, match_points=_MATCHED, calibrate_elevation=False)
+    preprocess = msgspec.structs.replace(config.preprocess, match_points=500, calibrate_elevation=False)
     config = msgspec.structs.replace(config, preprocess=preprocess)
     found, residuals, timing, is_spinning = None, list[NDArray[np.float64]](), log.config, False
     for window in log.windows(_AT, _SCANS):

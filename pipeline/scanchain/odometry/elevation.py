@@ -10,19 +10,16 @@ from typing import NamedTuple
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import Matrix, Points, Pose
+from scanchain.data import Matrix, Points, Pose, Vector
 from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
 from scanchain.kernels.scans import raise_elevation
 from scanchain.preprocess import Sweep
 from scanchain.registration.search import evenly
 
-_FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, their spacing in cells: first window, later ones
-_CELL_M = 1.0  # edge of a cell
-_RANGE_CELLS = 14.0  # least number of cells that the median range spans: cells shrink in narrow surroundings
-_SMALLEST = 0.125  # smallest factor on the edge of a cell
-_POINTS = 3500  # largest number of points of each scan, evenly spread
+_WINDOWS = ((14, 0.6), (16, 0.9))  # scans adjusted together, and their spacing in cells: the first time, later
+_RANGE_M, _SMALLEST_M = 14.0, 0.125  # median range at which cells are 1 m, and smallest cell
+POINTS = 3500  # largest number of points of each scan, evenly spread
 _STEPS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps; offset and turns of a converged one
-_KERNEL = 1.5 / 0.6745  # scale of the robust weight over the median residual
 _RIDGE = 1e-6  # regularizes directions that no plane constrains
 _SCATTER_RAD = math.radians(0.02)  # prior standard deviation of a window's offset in addition to its own σ
 _SHARED_RAD = math.radians(0.01)  # the part of it that is added to every window's σ for its weight
@@ -51,7 +48,7 @@ class ElevationCalibration:
     def __init__(self, *, is_wanted: bool) -> None:
         self.is_wanted = is_wanted
         self.offset_rad, self.sigma_rad = 0.0, math.inf
-        self.scale = 1.0
+        self.cell_m = 1.0
         self.windows = 0
         self.estimates: list[tuple[float, float]] = []  # offset and σ of each window
         self.reset()
@@ -87,8 +84,8 @@ class ElevationCalibration:
             return self._adopt(found) if found is not None else []
         if not self.is_wanted:
             return []
-        scans, spacing = _LATER if self.windows else _FIRST
-        spacing_m = spacing * self.scale * _CELL_M
+        scans, spacing = _WINDOWS[self.windows > 0]
+        spacing_m = spacing * self.cell_m
         if self.T_odom_last is not None and lie.apart(self.T_odom_last, T_odom_lidar)[0] < spacing_m:
             return []
         self.T_odom_last = T_odom_lidar
@@ -96,13 +93,12 @@ class ElevationCalibration:
             self.left_out += 1
             return []
         if not self.collected:
-            range_m = float(np.median(np.linalg.norm(points, axis=1)))
-            self.scale = min(max(2.0 ** round(math.log2(range_m / (_RANGE_CELLS * _CELL_M))), _SMALLEST), 1.0)
+            self.cell_m = cell_of(points)
         self.collected.append((points, T_odom_lidar))
         if len(self.collected) == scans:
             clouds, poses = zip(*self.collected, strict=True)
-            few = [evenly(cloud, _POINTS) for cloud in clouds]
-            self.adjusting = Adjusting(few, np.array(poses), self.scale * _CELL_M)
+            few = [evenly(cloud, POINTS) for cloud in clouds]
+            self.adjusting = Adjusting(few, np.array(poses), self.cell_m)
         return []
 
     def _adopt(self, found: Adjustment) -> list[tuple[Points, Pose]]:
@@ -142,6 +138,20 @@ def raised(points: Points, offset_rad: float) -> Points:
     return raise_elevation(np.ascontiguousarray(points, np.float64), offset_rad)
 
 
+def cell_of(points: Points) -> float:
+    """Edge in m of the cells that are searched for planes: small in narrow surroundings.
+
+    points : (N, 3) of a scan
+    """
+    range_m = float(np.median(np.linalg.norm(points, axis=1)))
+    return min(max(2.0 ** round(math.log2(range_m / _RANGE_M)), _SMALLEST_M), 1.0)
+
+
+def kernel_scale(residual: Vector) -> float:
+    """Scale in m of the robust weight of residuals (N,): 1.5 of their standard deviations by the median."""
+    return max(1.5 / 0.6745 * float(np.median(np.abs(residual))), 1e-6)
+
+
 class Adjusting:
     """Plane adjustment of poses and elevation offset: makes planes in several scans (N, 3) as thin as possible.
 
@@ -163,7 +173,7 @@ class Adjusting:
         count = planes(lifted, self.number, self.poses, self.cell_m, offset, residual, plane, normals)
         if not count:
             return Adjustment(self.poses, 0.0, math.inf)
-        scale_m = max(_KERNEL * float(np.median(np.abs(residual[plane >= 0]))), 1e-6)
+        scale_m = kernel_scale(residual[plane >= 0])
         H, of_planes = np.zeros((size + 1, size + 1)), (plane, offset, residual, normals[:count])
         variance, gain = plane_equations(lifted, self.number, *of_planes, self.poses, scale_m, H)
         H, b = H[:-1, :-1], H[:-1, -1]
@@ -176,8 +186,6 @@ class Adjusting:
         has_converged = abs(step[-1]) < _STEP_RAD and np.abs(twists[:, 3:]).max() < _TURN_RAD
         if not has_converged and abs(self.offset_rad) <= _LARGEST_RAD and self.steps < _STEPS:
             return None
-        poses, sigma_rad = (
-            self.last @ lie.between(self.poses[-1], self.poses),
-            math.sqrt(variance * inverse[-1, -1]),
-        )
+        poses = self.last @ lie.between(self.poses[-1], self.poses)
+        sigma_rad = math.sqrt(variance * inverse[-1, -1])
         return Adjustment(poses, self.offset_rad, sigma_rad)

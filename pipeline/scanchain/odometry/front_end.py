@@ -9,11 +9,11 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, RestForce, Scan, State
 from scanchain.graph.factors import edge_information
+from scanchain.graph.odometry_errors import JUMP_SIGMAS
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.odometry.odometry import Odometry, Tracked
 from scanchain.preprocess import Prepared
 
-_LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 _LATEST = 0.1  # weight of the last scan in the mean of the systematic errors
 
 
@@ -95,7 +95,7 @@ class FrontEnd:
         """Information (k, k) of the edge from the last keyframe to this one, with a floor under its variances."""
         sigmas = self.config.edge_sigma_m, self.config.edge_sigma_rad
         if self.lost:
-            sigmas = self.lost * _LOST_SIGMAS[0], self.lost * _LOST_SIGMAS[1]
+            sigmas = self.lost * JUMP_SIGMAS[0], self.lost * JUMP_SIGMAS[1]  # of as many scans
         if tracked.elsewhere_m > 0.0:
             sigmas = tracked.elsewhere_m, np.pi
         return edge_information(self.information, *sigmas)

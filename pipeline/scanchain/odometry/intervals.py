@@ -10,21 +10,19 @@ from typing import TypeVar
 import numpy as np
 
 from scanchain.checks import SMALLER_UNITS
-from scanchain.data import Scan
+from scanchain.data import SIMILAR_INTERVALS, Scan
 from scanchain.errors import InputError
+from scanchain.odometry.motion_filter import MEMORY
 from scanchain.trajectory import format_stamp
 
 Result = TypeVar("Result")
 
 _SHORTEST_S = 0.005  # below the period of any lidar: scans that follow each other faster came in a burst
 _GAP = 5.0  # times the usual interval: a longer one means that scans are missing
-_SIMILAR = 1.4  # largest ratio of two intervals that agree
 _LONGEST = 100.0  # times the usual interval: a longer one is no plausible interval of stamps
 _WRONG = 20.0  # ratio to the median of the last intervals, above which that replaces the usual interval
-_MEMORY = 0.9  # weight of the usual interval so far against the next one
 _RECENT = 15  # number of the last intervals that are retained
 _FEWEST = 4  # least number of them to detect a gap where the usual interval is shorter than any lidar's
-_PART = 0.5  # share of a scan's duration, below which the first interval is replaced by that duration
 _LOOKED_AT = 3  # intervals that are checked: fewer may all be in a burst or a gap
 _REMEMBERED = 10  # the same where they are shorter than any lidar's; also the number of intervals retained
 _MOST_SWEEPS = 2.0  # largest span of a scan's point times, in intervals between scans
@@ -54,7 +52,7 @@ class Intervals:
             if latest_s >= _SHORTEST_S or self.usual_s < _SHORTEST_S:
                 self.recent_s.append(latest_s)
             if not self.is_gap(self.last_s):
-                gain = 1.0 - _MEMORY if self.usual_s else 1.0
+                gain = 1.0 - MEMORY if self.usual_s else 1.0
                 self.usual_s += gain * (self.last_s - self.usual_s)
             median_s = sorted(self.recent_s)[len(self.recent_s) // 2] if len(self.recent_s) > 2 else self.usual_s
             if not median_s < _WRONG * self.usual_s < _WRONG**2 * median_s:
@@ -76,7 +74,7 @@ class Intervals:
         if not self.usual_s:
             interval_s = stamped_s if stamped_s > 0.0 else logged_s
             span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) else 0.0
-            return span_s if interval_s < _PART * span_s else interval_s
+            return span_s if interval_s < 0.5 * span_s else interval_s
         if _are_similar(stamped_s, self.usual_s):
             return stamped_s
         is_plausible = _are_similar(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
@@ -145,4 +143,4 @@ def _since(last: Scan, scan: Scan) -> tuple[float, float]:
 
 def _are_similar(a: float, b: float) -> bool:
     """True if two intervals are positive and of about the same length."""
-    return 0.0 < b <= _SIMILAR * a <= _SIMILAR**2 * b
+    return 0.0 < b <= SIMILAR_INTERVALS * a <= SIMILAR_INTERVALS**2 * b

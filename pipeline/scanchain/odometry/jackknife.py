@@ -28,7 +28,6 @@ from scanchain.threads import threads
 
 AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups; without a wider one, a plane may be unconstrained
 LONGEST = {2: 300, 3: 60}  # scans per window; a log of at most that many is measured as a whole
-_LEAST_SQUARE = 1e-6  # m², least sum of squared path lengths over a window, for one at standstill
 _TURN_M_RAD = 1.0  # path length that counts for a turn, with which errors grow as with translation
 
 
@@ -164,10 +163,8 @@ def _twists(
     middles_m = [path_m[each.first + len(each.complete) // 2] for each in measured]
     rates = np.array([_rates(each, path_m) for each in measured])
     at_m, length_m = 0.5 * (path_m[first] + path_m[last]), path_m[last] - path_m[first]
-    twists, is_measured = (
-        np.empty((rates.shape[1], len(first), rates.shape[2])),
-        np.zeros(len(first), dtype=np.bool_),
-    )
+    twists = np.empty((rates.shape[1], len(first), rates.shape[2]))
+    is_measured = np.zeros(len(first), dtype=np.bool_)
     for group, component in np.ndindex(rates.shape[1:]):
         twists[group, :, component] = length_m * np.interp(at_m, middles_m, rates[:, group, component])
     for each in measured:
@@ -183,7 +180,7 @@ def _rates(window: Window, path_m: NDArray[np.float64]) -> Matrix:
     sums = np.cumsum(_changes(window, scans[:-1], scans[1:]), axis=1)
     along_m = path_m[window.first + scans[1:]]
     along_m = along_m - along_m.mean()
-    return along_m @ sums / max(float(along_m @ along_m), _LEAST_SQUARE)
+    return along_m @ sums / max(float(along_m @ along_m), 1e-6)  # m²: at standstill
 
 
 def _changes(window: Window, first: NDArray[np.int64], last: NDArray[np.int64]) -> Matrix:

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 
-_MEMORY = 0.9  # weight of the mean of the squared errors so far against the next one
+MEMORY = 0.9  # weight of a running mean so far against the next value
+KNOWN = 5  # number of errors needed before their mean square is used
+CAUTION = 2.0  # factor from the root mean square of errors to the standard deviation that is used
+LEAST_SIGMAS = (0.002, 0.0005)  # m and rad, smallest standard deviation of a prior or a match
 _SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
-_KNOWN = 5  # number of errors needed before the mean is used
-_CAUTION = 2.0  # factor from the root mean square to the standard deviation of the prior
-_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation of the prior
 
 
 class ErrorStatistics:
@@ -22,7 +22,7 @@ class ErrorStatistics:
         """first_sigma : (k,) standard deviations until enough errors are known, and their upper limit."""
         self.first_sigma = first_sigma
         self.covariance = np.diag(first_sigma**2)  # (k, k) of the next prediction, conservative
-        self.least = (lie.by_component(len(first_sigma), _LEAST_M, _LEAST_RAD) ** 2).tolist()
+        self.least = (lie.by_component(len(first_sigma), *LEAST_SIGMAS) ** 2).tolist()
         self.most = (first_sigma**2).tolist()
         self.squares = [0.0] * len(first_sigma)
         self.count = 0
@@ -30,13 +30,13 @@ class ErrorStatistics:
     def update(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
         """Add the error (k,) of a prediction against a match, whose variance (k,) is subtracted."""
         self.count += 1
-        gain = max(1.0 - _MEMORY, 1.0 / self.count)
+        gain = max(1.0 - MEMORY, 1.0 / self.count)
         for m, (e, of_match) in enumerate(zip(error.tolist(), variance.tolist(), strict=True)):
             square = max(e * e - of_match, 0.0)
             self.squares[m] = max(self.squares[m] + gain * (square - self.squares[m]), _SUDDEN * square)
-        if self.count >= _KNOWN:
+        if self.count >= KNOWN:
             bounds = zip(self.squares, self.least, self.most, strict=True)
-            self.covariance = np.diag([min(max(_CAUTION**2 * s, least), most) for s, least, most in bounds])
+            self.covariance = np.diag([min(max(CAUTION**2 * s, least), most) for s, least, most in bounds])
 
 
 class MotionFilter:

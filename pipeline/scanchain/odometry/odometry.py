@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config, MatchingConfig
-from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior, RaySpan, Scan, State, brief
+from scanchain.data import FEWEST_COPIED, LEAST_FIT, Match, Points, Pose, Prior, RaySpan, Scan, State, brief
 from scanchain.errors import InputError, counted, shown
 from scanchain.growing_array import read_only
 from scanchain.kernels.geometry import largest_magnitude
@@ -28,8 +28,6 @@ from scanchain.settings import check_dimension, check_order, load_settings
 
 COPY = "bitwise copy of the previous scan: same pose, no information on the motion since"
 NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
-_SAMPLE = 1000  # number of points, evenly spread, that are compared between two scans
-_FEWEST_COPIED = 10  # least number of points for a scan to count as a copy
 
 
 class Tracked(msgspec.Struct, frozen=True):
@@ -144,8 +142,8 @@ class Odometry:
         if self.config.odometry.imu:
             self.predictor.gyro.add(scan)
         self.scans += 1
-        sample = scan.points[:: len(scan.points) // _SAMPLE + 1].tobytes()
-        if self.last is not None and sample == self.last_sample and len(scan.points) >= _FEWEST_COPIED:
+        sample = scan.points[:: len(scan.points) // 1000 + 1].tobytes()  # at most 1000 points
+        if self.last is not None and sample == self.last_sample and len(scan.points) >= FEWEST_COPIED:
             repeated = scan if scan.is_copy else replace(scan, is_copy=True)
             changed = {"reason": COPY, "is_repeated": True, "elsewhere_m": 0.0, "innovations": {}}
             return _owned(msgspec.structs.replace(self.last, scan=repeated, **changed))

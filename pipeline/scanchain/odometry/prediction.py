@@ -15,24 +15,23 @@ from scanchain.data import LEAST_FIT, Match, Matrix, Pose, Prior, RestForce, Sca
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
-from scanchain.odometry.accelerometer import Accelerometer
+from scanchain.odometry.accelerometer import FASTEST_M_S, Accelerometer
 from scanchain.odometry.gyro import Gyro
 from scanchain.odometry.intervals import Intervals
-from scanchain.odometry.motion_filter import ErrorStatistics, MotionFilter
+from scanchain.odometry.motion_filter import MEMORY, ErrorStatistics, MotionFilter
 from scanchain.odometry.wheels import Wheels
 from scanchain.preprocess import ScanMotion, Sweep
 
 _CERTAIN = 5.0  # largest standard deviations within which the pose is that an IMU predicts
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
-_LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps are too close
+_LEAST_WINDOW = 0.3  # m and rad, least half width where stamps are too close
 _LARGEST_WINDOW_M = 5.0  # largest half width of the search window
 _ACCELERATION_M_S2 = 4.0  # of a car; limits the search window around the predicted pose in space
-_FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
+_LARGEST_REACH_M = 30.0  # largest half width in space
 _LEAST_M = 0.05  # least of the largest standard deviations of a translation by an IMU
 _BURST = 0.05  # of the usual interval: a shorter one is due to a burst and gives no velocity
 _JUMP = 1.0  # m and rad, difference of two motions per scan, above which the wheels may have jumped
 _LEAST_TURN = 0.3  # of a rotation in the worst direction of a scan, a unit twist, that leaves the rotation open
-_MEMORY = 0.9  # weight of the share of doubtful scans so far against the next one
 _MOST_DOUBTFUL = 0.5  # share of lost or contradicted scans, above which scans cannot refute the wheels
 
 
@@ -117,7 +116,7 @@ class Prediction(msgspec.Struct, frozen=True):
     def farthest_m(self) -> float:
         """Largest plausible distance of a vehicle from the predicted pose."""
         elapsed_s = max(self.interval_s, self.usual_s, self.silence_s) + self.lost_s
-        return 1.0 + elapsed_s * max(self.config.max_speed_m_s, _FASTEST_M_S)
+        return 1.0 + elapsed_s * max(self.config.max_speed_m_s, FASTEST_M_S)
 
     @property
     def is_out_of_reach(self) -> bool:
@@ -130,15 +129,15 @@ class Prediction(msgspec.Struct, frozen=True):
         In space the first follows from a vehicle's acceleration, the second, for where that fails, from its speed.
         """
         elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
-        half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi)
+        half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW), math.pi)
         if self.source.turns:
             half_width_rad = _CERTAIN * float(self.prior.widest[-1])
         if self.source is Source.IMU:
             return ((_CERTAIN * float(self.prior.widest[:3].max()), half_width_rad),)
         if len(self.T_odom_last) == 3:
-            half_width_m = min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M)
+            half_width_m = min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW), _LARGEST_WINDOW_M)
             return ((half_width_m, half_width_rad),)
-        by_speed = min(elapsed_s * max(self.config.max_speed_m_s, _FASTEST_M_S), _LARGEST_REACH_M), half_width_rad
+        by_speed = min(elapsed_s * max(self.config.max_speed_m_s, FASTEST_M_S), _LARGEST_REACH_M), half_width_rad
         if self.is_second or self.is_guess:
             return (by_speed,)
         by_acceleration = min(max(elapsed_s**2 * _ACCELERATION_M_S2, 1.0), by_speed[0]), half_width_rad
@@ -320,7 +319,7 @@ class Predictor:
                 self.accelerometer.correct(T_odom_lidar, None if state is State.LOST else match, continued[:3, 3])
         self.scans += 1
         is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)
-        self.doubtful += max(1.0 - _MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)
+        self.doubtful += max(1.0 - MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)
         is_known = not (prediction.is_guess or prediction.is_second)
         if is_known and largest_magnitude(T_odom_lidar - prediction.T_odom_lidar) > _JUMP:
             self.doubtful = 1.0

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, Match, Points, Pose, State
+from scanchain.odometry.motion_filter import MEMORY
 from scanchain.odometry.prediction import Prediction
 from scanchain.preprocess import Sweep
 from scanchain.registration import Matcher, SearchGrid, VoxelMap, Wanted, Window, find, thinned
@@ -26,13 +27,9 @@ _ROUGH = 0.05  # share of the cost of a point without a correspondence, below wh
 _UNUSUAL = 1.5  # cost per point over its running mean, above which a contradicted pose in space is searched
 CLEARLY = 0.8  # share of the cost of the current pose, below which another one replaces it
 _SAME_RAD = 0.05  # largest angle between two poses of one minimum; their largest distance is a voxel
-_SEEDS = 3  # number of initial poses from upright structure that are aligned
 _COLUMNS = 300  # columns of upright structure that are scored, evenly spread
-_COLUMNS_APART, _COLUMNS_SHARE = 3.0, 0.6  # of these poses: distance in voxels, share of the best score
 _LONG_S = 1.0  # shortest gap after which a robot may have turned around
-_SEEDS_APART_M, _SEEDS_SHARE = 1.0, 0.8  # of initial poses in the plane: least distance, share of the best score
 _NEAR_PERCENT = 95.0  # share of the points within the radius of the map that is searched in space
-_MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
 _Aligned = tuple[Match, NDArray[np.float64] | None]
 
@@ -74,7 +71,7 @@ class Recovery:
             best, rival = self._decided(best, tried, surfaces, prediction)
         if surfaces.dimension == 2 or is_sound(best):
             cost = best.cost / len(points)
-            self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
+            self.usual_cost = MEMORY * self.usual_cost + (1.0 - MEMORY) * cost if self.usual_cost else cost
         return best, rival
 
     def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
@@ -176,7 +173,7 @@ def from_above(
     near = means[np.abs(means[:, :2]).max(axis=1, initial=0.0) <= radius_m]
     grid = SearchGrid.of_points(upright_columns(near, size_m), size_m)
     columns = evenly(upright_columns(structure, size_m), _COLUMNS)
-    for found in find(columns, grid, window, Wanted(_COLUMNS_APART * size_m, _COLUMNS_SHARE, _SEEDS)):
+    for found in find(columns, grid, window, Wanted(apart_m=3.0 * size_m, rival=0.6, answers=3)):
         yield T_predicted @ lie.lift(found.T_target_source)
 
 
@@ -187,8 +184,7 @@ def is_sound(match: Match) -> bool:
 
 def _is_near(T: Pose, T_other: Pose, size_m: float) -> bool:
     """True if two poses are so close that they belong to one minimum."""
-    away_m, away_rad = lie.apart(T, T_other)
-    return away_m < size_m and away_rad < _SAME_RAD
+    return lie.agree(T, T_other, size_m, _SAME_RAD)
 
 
 def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tuple[Pose, ...]:
@@ -200,7 +196,7 @@ def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tupl
     reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
     T_predicted = prediction.T_odom_lidar
     grid = SearchGrid.of_voxels(surfaces, T_predicted, reach_m)
-    wanted = Wanted(_SEEDS_APART_M, _SEEDS_SHARE, answers=2 if _is_free(prediction) else 1)
+    wanted = Wanted(apart_m=1.0, rival=0.8, answers=2 if _is_free(prediction) else 1)
     window = Window(T_predicted, half_width_m, half_width_rad)
     seeds = find(thinned(points, grid.resolution_m), grid, window, wanted)
     return (*alternatives, *(seed.T_target_source for seed in seeds))

@@ -8,23 +8,21 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Match, Pose
 from scanchain.kernels.matrices import definite_inverse
+from scanchain.odometry.motion_filter import CAUTION, KNOWN, LEAST_SIGMAS
 
 _SCANS = 10  # number of scans in agreement with one pose that establish a standstill
 _AGAIN = 30  # the same for another pose near the one that is kept
 _SETTLING = 0.2  # least weight of a match in the mean of the first ones, whose map is made of few scans
-_SETTLING_M, _SETTLING_RAD = 0.004, 0.001  # smallest standard deviation of these matches
+_SETTLING_SIGMAS = (0.004, 0.001)  # m and rad, smallest standard deviation of these matches
 _SUDDEN = 5.0  # standard deviations beyond which one innovation contradicts a standstill
 _LASTING = 3.0  # the same for the running mean of the innovations
-_CAUTION = 2.0  # factor from the root mean square to the standard deviation that is used
 _GAIN = 0.3  # least weight of the next value in the running mean of the innovations
 _SCATTER_GAIN = 0.1  # the same in that of the squared steps
 _AVERAGED = 0.25  # least variance of that mean over that of one innovation: errors are correlated
-_KNOWN = 5  # number of steps at which their scatter replaces the variance of a match
-_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation of a match
-_LARGEST_M, _LARGEST_RAD = 0.01, 0.005  # largest one; weaker matches cannot show a standstill
-_FIRST_M, _FIRST_RAD = 0.015, 0.002  # largest distance of a match to a map of a single scan, biased by its noise
-_NEAR_M, _NEAR_RAD = 0.02, 0.004  # distance from the mean beyond which (and _SUDDEN) the lidar has moved off
-_SAME_M, _SAME_RAD = 0.002, 0.001  # distance between two means up to which they are one standstill
+_LARGEST_SIGMAS = (0.01, 0.005)  # m and rad, largest of a match; weaker ones cannot show a standstill
+_FIRST = (0.015, 0.002)  # m and rad, largest distance of a match to a map of a single scan, biased by its noise
+_NEAR = (0.02, 0.004)  # m and rad, distance from the mean beyond which (and _SUDDEN) the lidar has moved off
+_SAME = (0.002, 0.001)  # m and rad, distance between two means up to which they are one standstill
 
 
 class Standstill:
@@ -68,7 +66,7 @@ class Standstill:
         if self.is_beginning:
             self.is_beginning = False
             self.bias = lie.log(lie.between(self.T_odom_lidar, match.T_target_source))
-            limits = np.maximum(_limits(self.bias, _FIRST_M, _FIRST_RAD), _LASTING * np.sqrt(_variances(match)))
+            limits = np.maximum(_limits(self.bias, _FIRST), _LASTING * np.sqrt(_variances(match)))
             self.is_settling = bool((np.abs(self.bias) < limits).all())
             self.held = AgreeingMatches(match.T_target_source) if self.is_settling else None
             return self.is_settling
@@ -87,7 +85,7 @@ class Standstill:
         sigma = np.sqrt(_variances(match))
         if self.held is not None:
             away = np.abs(lie.log(lie.between(self.held.T_mean, match.T_target_source)))
-            if (away > np.maximum(_limits(away, _NEAR_M, _NEAR_RAD), _SUDDEN * sigma)).any():
+            if (away > np.maximum(_limits(away, _NEAR), _SUDDEN * sigma)).any():
                 self.held = None
         if self.elsewhere is None or not self.elsewhere.takes(match):
             self.elsewhere = AgreeingMatches(match.T_target_source)
@@ -114,7 +112,7 @@ class Standstill:
         bias = np.clip(away, np.minimum(self.bias, 0.0), np.maximum(self.bias, 0.0))
         moved = away - bias
         self.bias = bias
-        if (np.abs(moved) < np.maximum(_limits(moved, _SAME_M, _SAME_RAD), sigma)).all():
+        if (np.abs(moved) < np.maximum(_limits(moved, _SAME), sigma)).all():
             if mean is not self.held:
                 self.held.mean_innovation = np.zeros(len(moved))
             return
@@ -139,12 +137,10 @@ class AgreeingMatches:
         """True if a match agrees, and is then added; the mean of the innovations includes it in any case."""
         innovation = lie.log(lie.between(self.T_mean, match.T_target_source))
         variances = _variances(match)
-        if self.steps >= _KNOWN:
-            variances = np.clip(
-                _CAUTION**2 * self.squares, _limits(innovation, _LEAST_M, _LEAST_RAD) ** 2, variances
-            )
+        if self.steps >= KNOWN:  # the scatter of the steps replaces the variance of the match
+            variances = np.clip(CAUTION**2 * self.squares, _limits(innovation, LEAST_SIGMAS) ** 2, variances)
         if is_settling:
-            variances = np.maximum(variances, _limits(innovation, _SETTLING_M, _SETTLING_RAD) ** 2)
+            variances = np.maximum(variances, _limits(innovation, _SETTLING_SIGMAS) ** 2)
         latest = 1.0 / (self.steps + 1)
         self.mean_innovation = self.mean_innovation + max(_GAIN, latest) * (innovation - self.mean_innovation)
         is_sudden = innovation**2 > _SUDDEN**2 * variances
@@ -164,10 +160,10 @@ class AgreeingMatches:
 def _variances(match: Match) -> NDArray[np.float64]:
     """Variances (k,) of a match from its own information, within the limits."""
     variances = np.diag(definite_inverse(match.information))
-    least, largest = _limits(variances, _LEAST_M, _LEAST_RAD), _limits(variances, _LARGEST_M, _LARGEST_RAD)
+    least, largest = _limits(variances, LEAST_SIGMAS), _limits(variances, _LARGEST_SIGMAS)
     return np.clip(variances, least**2, largest**2)
 
 
-def _limits(twist: NDArray[np.float64], meters: float, radians: float) -> NDArray[np.float64]:
-    """(k,) limits of the components of a twist (k,)."""
-    return lie.by_component(len(twist), meters, radians)
+def _limits(twist: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np.float64]:
+    """(k,) limits of the components of a twist (k,), from those in meters and radians."""
+    return lie.by_component(len(twist), *limits)

@@ -22,12 +22,11 @@ from scanchain.registration.voxel_map import VoxelMap
 from scanchain.settings import Override, load_settings
 
 _RANGE_VOXELS = {2: 40.0, 3: 14.0}  # largest number of voxels that the median distance from the centroid spans
-_WINDOW, _WINDOW_RAD = 0.5, 1.0  # half the window searched in the plane: share of that distance, and angle
-_SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # initial poses in the plane: number, distance, share of best score
+_WINDOW = (0.5, 1.0)  # half the window searched in the plane: share of that distance, and rad
+_SEEDS = Wanted(apart_m=1.0, rival=0.6, answers=6)  # initial poses in the plane
 _SEEN_FROM = 3.0  # largest distance of a sensor, in the origin, from the centroid, in such median distances
-_ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance above which two matches are distinct
+_ELSEWHERE = (0.1, 0.05)  # m and rad, distance above which two matches are distinct
 AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
-_HALVINGS = 2  # largest number of times that voxels are halved
 _MOST = 3  # times the number of points to match, above which more points only cost time
 _SAME = 0.1  # voxels; largest distance of equal poses found at two voxel sizes
 _GAIN = 12.5  # least decrease of cost, in variances of a range, to leave the guess along a weak direction: 5 σ
@@ -103,7 +102,7 @@ def _at_another_scale(
     Voxels that hold both sides of a plank leave its pose undetermined: halved ones are tried, as fine as the point
     density allows. Surfaces rougher than the width of the kernel contradict any pose: doubled ones are tried.
     """
-    for _ in range(_HALVINGS):
+    for _ in range(2):
         if match.observability >= 1.0 or size_m <= finest_m:
             break
         size_m = max(0.5 * size_m, finest_m)
@@ -115,8 +114,8 @@ def _at_another_scale(
         coarser = matched(2.0 * size_m, match.T_target_source)
         if coarser.converged:  # found at one scale, confirmed at the other
             again = matched(size_m, coarser.T_target_source)
-            apart_m, apart_rad = lie.apart(again.T_target_source, coarser.T_target_source)
-            if again.converged or (apart_m < _SAME * size_m and apart_rad < _ELSEWHERE_RAD):
+            same = again.T_target_source, coarser.T_target_source, _SAME * size_m, _ELSEWHERE[1]
+            if again.converged or lie.agree(*same):
                 match = again if again.converged else coarser
     return match
 
@@ -151,9 +150,8 @@ def _matched(
         return match
     grid = SearchGrid.of_voxels(local_map, T_first)
     turned = thinned(lie.transform(T_pivot_source, sparse), grid.resolution_m)
-    window = Window(T_first @ lie.inverse(T_pivot_source), _WINDOW * range_m, _WINDOW_RAD)
-    seeds = find(turned, grid, window, Wanted(_SEEDS_APART_M, _RIVAL, _SEEDS))
-    found = (seed.T_target_source @ T_pivot_source for seed in seeds)
+    window = Window(T_first @ lie.inverse(T_pivot_source), _WINDOW[0] * range_m, _WINDOW[1])
+    found = (seed.T_target_source @ T_pivot_source for seed in find(turned, grid, window, _SEEDS))
     return _unambiguous([match, *(matcher.align(sparse, local_map, T_seed) for T_seed in found)])
 
 
@@ -161,10 +159,10 @@ def _unambiguous(matches: Sequence[Match]) -> Match:
     """The match of lowest cost, not converged where a distinct one fits nearly as well."""
     best = min(matches, key=lambda match: match.cost)
     for other in matches:
-        apart_m, apart_rad = lie.apart(best.T_target_source, other.T_target_source)
-        is_elsewhere = apart_m > _ELSEWHERE_M or apart_rad > _ELSEWHERE_RAD
-        if best.converged and is_elsewhere and other.cost < AMBIGUOUS * best.cost:
-            best = as_ambiguous(best, apart_m, apart_rad)
+        T, T_other = best.T_target_source, other.T_target_source
+        is_rival = other.cost < AMBIGUOUS * best.cost and not lie.agree(T, T_other, *_ELSEWHERE)
+        if best.converged and is_rival:
+            best = as_ambiguous(best, *lie.apart(T, T_other))
     return best
 
 

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 
-PAIR_M, _TURN_M_RAD = 0.3, 0.5  # least path length of a pair of motions; path length per rad of rotation
+PAIR_M, TURN_M_RAD = 0.3, 0.5  # least path length of a pair of motions; path length per rad of rotation
 _FEWEST, _LEARNED = 6, 1.2  # least number of pairs, for four unknowns; growth of it before the next estimate
-_ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; initial and smallest σ of a residual
+_USUAL_M, _LEAST_M = 0.02, 0.002  # initial and smallest σ of a residual of the robust regression
 _PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information: position to 1 m, the rest nearly free
 _LARGEST_SHARE = 0.25  # residual as a share of the motions, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of an observable yaw and position
-_OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # least negative correlation of turns, and turn, to find a lidar upside down
+OPPOSED = 0.5  # least negative correlation of turns of a mirrored sensor
+_LEAST_TURN_RAD = 0.3  # least turn to find a lidar upside down
 _APART_M, _EXPLAINED = 0.2, 0.5  # least offset and largest ``left`` of a mounting other than identity
 
 
@@ -71,7 +72,7 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
     if len(base) < _FEWEST:
         return None
     turn, theta = lie.log(base)[:, -1], lie.log(lidar)[:, -1]
-    is_opposed = turn @ theta < -_OPPOSED * np.linalg.norm(turn) * np.linalg.norm(theta)
+    is_opposed = turn @ theta < -OPPOSED * np.linalg.norm(turn) * np.linalg.norm(theta)
     up = -1.0 if is_opposed and np.linalg.norm(turn) > _LEAST_TURN_RAD else 1.0
     c, s, x, y = np.cos(theta) - 1.0, up * np.sin(theta), lidar[:, 0, -1], up * lidar[:, 1, -1]
     J = np.stack([np.stack([c, -s, -x, y], axis=1), np.stack([s, c, -y, -x], axis=1)], axis=1)  # (M, 2, 4)
@@ -93,14 +94,14 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
 
 def path_m(motions: Matrix) -> NDArray[np.float64]:
     """Lengths (...) of motions (..., d+1, d+1), turns on the spot included."""
-    return np.linalg.norm(motions[..., :-1, -1], axis=-1) + _TURN_M_RAD * lie.rotation_angle(motions)
+    return np.linalg.norm(motions[..., :-1, -1], axis=-1) + TURN_M_RAD * lie.rotation_angle(motions)
 
 
 def _solved(J: Matrix, z: Matrix) -> tuple[NDArray[np.floating], NDArray[np.float64], float]:
     """Covariance (4, 4) and value (4,) of J (M, 2, 4) p = z (M, 2), with the prior; median residual."""
     weight, variance = np.ones(len(z)), _USUAL_M**2
     H, p, residuals = np.eye(4), np.zeros(4), np.zeros(len(z))
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + _PRIOR
         p = np.linalg.solve(H, np.einsum("mij,m,mi->j", J, weight, z) / variance)
         residuals = np.linalg.norm(z - J @ p, axis=1)

@@ -17,22 +17,17 @@ from scanchain.kernels.registration.match import Result, match
 from scanchain.kernels.registration.residuals import Settings
 from scanchain.registration.voxel_map import VoxelMap
 
-OPTIMIZERS = {
-    "gradient-descent": icp.GRADIENT_DESCENT,
-    "newton": icp.NEWTON,
-    "gauss-newton": icp.GAUSS_NEWTON,
-    "levenberg-marquardt": icp.LEVENBERG_MARQUARDT,
-}
+OPTIMIZERS = {each.name.lower().replace("_", "-"): int(each) for each in icp.Optimizer}
 
 _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is always searched; limit in voxels
 _LEAST_OVERLAP = 0.75  # least share of points with a correspondence; correct poses in simulations exceed it
 _REDUNDANCY = 10  # correspondences on surfaces per degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
 _KERNEL_SIGMAS = 4.0  # least kernel scale, in standard deviations of a range
-_ENDINGS = {
-    icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
-    icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",
-    icp.SINGULAR: "the correspondences do not determine the pose",
+_ENDINGS: dict[int, str] = {
+    icp.Ending.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
+    icp.Ending.NO_CORRESPONDENCES: "no point has a correspondence in the map",
+    icp.Ending.SINGULAR: "the correspondences do not determine the pose",
 }
 
 
@@ -118,7 +113,7 @@ def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConf
         iterations=result.iterations,
         residual_m=result.residual_m,
         fit=result.fit,
-        at_minimum=result.ending == icp.CONVERGED,
+        at_minimum=result.ending == icp.Ending.CONVERGED,
         converged=not problem.text,
         reason=problem.text or "converged",
         cause=problem.cause,
@@ -137,7 +132,7 @@ def _problems(
     kernel_scale_m = kernel_scale_of(config, target)
     if not math.isfinite(largest_magnitude(result.T)):
         yield Problem.plain("the pose is not finite")
-    if result.ending == icp.NO_CORRESPONDENCES:
+    if result.ending == icp.Ending.NO_CORRESPONDENCES:
         yield Problem.plain(_ENDINGS[result.ending])
     if result.pairs < config.min_inlier_share * points:
         yield Problem(
@@ -153,7 +148,7 @@ def _problems(
             f"matching.min_signal ({config.min_signal:g}) or matching.min_information "
             f"({config.min_information:g})",
         )
-    if result.ending != icp.CONVERGED:
+    if result.ending != icp.Ending.CONVERGED:
         yield Problem.plain(_ENDINGS[result.ending])
     if result.fit < LEAST_FIT:
         yield Problem(

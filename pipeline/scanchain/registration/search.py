@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from scanchain import lie
 from scanchain.data import Points, Pose
-from scanchain.kernels.search import NEAR, SURFACE, TURNS, climb, score_windows, split_best
+from scanchain.kernels.search import TURNS, Score, climb, score_windows, split_best
 from scanchain.preprocess import downsample
 from scanchain.registration.voxel_map import VoxelMap
 
@@ -22,7 +22,7 @@ _SIZE = 2**_TOP
 _MIN_RANGE = 10.0  # least median range, in cells, for the step of the headings
 _ADDITIONS = 250_000_000  # of scores per slice of a search, 20 to 40 ms
 _STEPS = 150_000  # windows that are split per slice
-_POINTS = 120  # largest number of points of a planar scan that are scored, one per cell, evenly spread
+POINTS = 120  # largest number of points of planar scans that are scored, one per cell
 _TALL = 0.75  # cells between lowest and highest point of a column, above which it is upright structure
 
 
@@ -111,7 +111,7 @@ class SearchGrid:
         """Local maximum of the score of points (N, 2), in steps of half a cell and ``step_rad``, then finer."""
         pose = np.array([*T[:2, 2], lie.yaw(T)])
         score = climb(self.pyramid[0], points, self.origin_m, self.resolution_m, pose, step_rad)
-        return Found(lie.pose_2d(*pose.tolist()), float(score) / SURFACE)
+        return Found(lie.pose_2d(*pose.tolist()), float(score) / Score.SURFACE)
 
 
 class Search:
@@ -145,7 +145,7 @@ class Search:
         self.has_room = np.asarray(blocks.any(axis=(1, 3)))
         past_last = self.has_room.shape[1] - self.has_room[:, ::-1].argmax(axis=1)  # per row, if any has room
         self.spans = np.column_stack([self.has_room.argmax(axis=1), past_last * self.has_room.any(axis=1)])
-        self.full = SURFACE * len(points)
+        self.full = Score.SURFACE * len(points)
         self.least = max(wanted.least * self.full, 1.0)
         additions = int(np.diff(self.spans).sum()) * len(points)
         self.headings = TURNS * max(_ADDITIONS // max(additions, 1), 1)
@@ -211,8 +211,8 @@ def draw_surfaces(cells: NDArray[np.int8], rows: NDArray[np.int64], columns: NDA
     """Set the scores of cells with surfaces, and of their neighbors; none may lie on the border."""
     for row in (rows - 1, rows, rows + 1):
         for column in (columns - 1, columns, columns + 1):
-            cells[row, column] = np.maximum(cells[row, column], NEAR)
-    cells[rows, columns] = SURFACE
+            cells[row, column] = np.maximum(cells[row, column], Score.NEAR)
+    cells[rows, columns] = Score.SURFACE
 
 
 def evenly(points: Points, most: int) -> Points:
@@ -221,8 +221,8 @@ def evenly(points: Points, most: int) -> Points:
 
 
 def thinned(points: Points, size_m: float) -> Points:
-    """Points (N, 2) of a scan, downsampled to one per cell and at most _POINTS."""
-    return evenly(downsample(points, size_m), _POINTS)
+    """Points (N, 2) of a scan, downsampled to one per cell and at most POINTS, evenly spread."""
+    return evenly(downsample(points, size_m), POINTS)
 
 
 def upright_columns(points: Points, size_m: float) -> Points:

@@ -85,14 +85,14 @@ class SvdMatcher:
         lengths = lie.by_component(len(predicted.widest), 1.0, problem.range_m)  # that a unit twist moves a point
         limits = _LEFT * lie.by_component(len(lengths), settings.tolerance_m, settings.tolerance_rad) * lengths
         last = moved = np.zeros(len(lengths))
-        T, scale_m, iterations, ending = T_first.copy(), settings.first_scale_m, 0, icp.OUT_OF_ITERATIONS
-        while ending == icp.OUT_OF_ITERATIONS and iterations < settings.max_iterations:
+        T, scale_m, iterations, ending = T_first.copy(), settings.first_scale_m, 0, icp.Ending.OUT_OF_ITERATIONS
+        while ending == icp.Ending.OUT_OF_ITERATIONS and iterations < settings.max_iterations:
             iterations += 1
             pairs = icp.closest_pairs(problem, T, scale_m, source, closest, weight)
             try:
                 closed_form = rigid_transform(source[:pairs], closest[:pairs], weight[:pairs])
             except DegeneratePairsError:
-                ending = icp.SINGULAR if pairs else icp.NO_CORRESPONDENCES
+                ending = icp.Ending.SINGULAR if pairs else icp.Ending.NO_CORRESPONDENCES
                 break
             step = _RELAXATION * lengths * lie.log(lie.between(T, closed_form @ T))
             change, is_shrinking = step - last, step @ step < last @ last
@@ -100,7 +100,7 @@ class SvdMatcher:
             last, moved = step, step - share * (moved + change)
             T = lie.normalize(T @ lie.exp(moved / lengths))
             if scale_m <= settings.scale_m and (np.abs(moved) < limits).all():
-                ending = icp.CONVERGED
+                ending = icp.Ending.CONVERGED
             scale_m = max(settings.scale_m, SHRINK * scale_m)
         result = assess(target.voxels, points, T, predicted, iterations, ending, settings)
         return match_of(result, len(points), target, self.config)

@@ -16,7 +16,6 @@ _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # number at which a voxel is fitted without its neighbors
 _NOISE_VOXELS = {2: 2.5, 3: 3.0}  # least voxel size, in standard deviations of a range, to resolve a surface
 _ALONE = 120.0  # ratio of a voxel's squared size to the noise variance in a plane: 12 (uniform) times 10
-_LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least capacity in voxels
 _SWEEP_EVERY = 20  # insertions between two removals of far and old voxels
 _RECENT = 20  # number of last scans from which the map is rebuilt with other voxels
 _SAME_NOISE = 0.1  # largest relative difference of two standard deviations that count as equal
@@ -42,7 +41,7 @@ class VoxelMap:
         self.noise_m = noise_m
         self.scale = max(checks.positive(scale, "scale"), _NOISE_VOXELS[dimension] * noise_m / config.voxel_size_m)
         self.insertions = 0
-        self.voxels = _empty(_LEAST, self.scale * config.voxel_size_m)
+        self.voxels = _empty(0, self.scale * config.voxel_size_m)
         noisy = 2.0 * (_ALONE * (noise_m / self.voxels.size_m) ** 2) ** 2
         self.alone = max(_MIN_POINTS_ALONE[dimension], noisy)  # points needed to resolve a plane despite the noise
 
@@ -71,7 +70,7 @@ class VoxelMap:
 
     def compact(self) -> None:
         """Free the memory reserved for further points."""
-        kept = _empty(len(self), self.voxels.size_m, _LEAST_COMPACT)
+        kept = _empty(len(self), self.voxels.size_m, 1 << 8)
         if len(kept.cells) < len(self.voxels.cells):
             keep(self.voxels, kept, 0.0, 0.0, 0.0, np.inf, 0)
             self.voxels = kept
@@ -131,7 +130,7 @@ class MapKeeper:
             self.surfaces.insert(points, T_odom_lidar)
 
 
-def _empty(room: int, voxel_size_m: float, least: int = _LEAST) -> Voxels:
+def _empty(room: int, voxel_size_m: float, least: int = 1 << 12) -> Voxels:
     capacity = 1 << int(np.ceil(np.log2(max(room, least))))
     return Voxels(
         rows=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int32),

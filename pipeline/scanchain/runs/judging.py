@@ -31,8 +31,6 @@ from scanchain.verdict import Judged, apart_m, judge
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_FEWEST = 3  # minimum number of scans with a pose
-
 
 class Known(msgspec.Struct):
     """Figures of a run's metrics that a verdict needs."""
@@ -86,7 +84,7 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
     stamps_ns, log_times_ns, points, wheels = _table(log, config)
     placeholders = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
     pairs = pair(Trajectory(stamps_ns, placeholders), poses)
-    if len(pairs) < _FEWEST:
+    if len(pairs) < 3:
         raise InputError(f"{file}: has poses at {len(pairs)} of {len(stamps_ns)} scans; it must be of this log")
     found = pairs.places
     T_world_lidar = lie.flatten(pairs.reference) if log.dimension == 2 else pairs.reference

@@ -26,7 +26,6 @@ _CONDITIONS = {
     Verdict.CHECK: " if no segment is wrong",
     Verdict.NOT_TRUSTWORTHY: " if the trajectory were right",
 }
-_NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
 class Accuracy(Struct, frozen=True):
@@ -153,12 +152,7 @@ class Metrics(Struct, frozen=True):
 
 
 def measure(
-    results: Results,
-    expected: ExpectedError | None,
-    judged: Judged,
-    *,
-    run_s: float,
-    **of_run: Any,
+    results: Results, expected: ExpectedError | None, judged: Judged, *, run_s: float, **of_run: Any
 ) -> Metrics:
     """Metrics of a finished run; ``of_run`` are those that are neither of its scans nor of its results."""
     result, cloud, final, steps = results.result, results.cloud, results.final, results.result.steps
@@ -278,7 +272,7 @@ def lines_of(m: Metrics) -> Iterator[tuple[str, str]]:
         yield "calibration", f"{angles} from scan {m.calibrated_from:,} on (preprocess.calibrate_elevation)"
     yield from (("odometry", error) for error in m.odometry_errors)
     compiling = f" (and {m.compile_s:.0f} s compiling, once after an installation)"
-    took = f"{m.run_s:.1f} s{compiling if m.compile_s >= _NOTICEABLE_S else ''} with map and results"
+    took = f"{m.run_s:.1f} s{compiling if m.compile_s >= 0.5 else ''} with map and results"
     yield "time", f"{took}, {counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time"
 
 

@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
-_MOST_SCANS = 20_000  # maximum number of scans, evenly spread over the log, whose errors are estimated
 _TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground above which it is reported
 
 
@@ -172,7 +171,7 @@ def systematic_of(
     distorted_share : share of the motion between two scans by which they may be distorted
     """
     keyframes, odometry = np.array([keyframe.scan_index for keyframe in result.keyframes]), result.odometry.poses
-    chosen = np.union1d(np.arange(0, len(odometry), math.ceil(len(odometry) / _MOST_SCANS)), keyframes)
+    chosen = np.union1d(np.arange(0, len(odometry), math.ceil(len(odometry) / 20_000)), keyframes)  # evenly spread
     found, open_motions = None, np.zeros((len(chosen), result.graph.freedom))
     if scans is not None:
         mounting, offset_rad = result.T_base_lidar, result.elevation_offset_rad

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix, Points, Pose
+from scanchain.data import Matrix, Pose
 from scanchain.logs import Log
 from scanchain.logs.mounting import MovingFrame, moving_frame
 from scanchain.logs.writer import (
@@ -49,7 +49,8 @@ def write_results_mcap(path: Path, log: Log, result: SlamResult, T_world_grid: P
         T_grid_corner[:2, -1] = origin_m
         data = pack_grid(first_ns, _WORLD, cells, resolution_m, place(T_world_grid @ T_grid_corner))
         writer.append("/map", "nav_msgs/msg/OccupancyGrid", data, first_ns, first_log_ns)
-        data = pack_cloud(first_ns, _WORLD, _rows(read_ply(path.with_name("map.ply"))))
+        points = lie.lift_points(read_ply(path.with_name("map.ply"))).astype("<f4")
+        data = pack_cloud(first_ns, _WORLD, points.view([(name, "<f4") for name in "xyz"])[:, 0])
         writer.append("/map_cloud", "sensor_msgs/msg/PointCloud2", data, first_ns, first_log_ns)
         _write_motion(writer, moving, steps, trajectory.poses)
 
@@ -84,8 +85,3 @@ def _write_motion(writer: LogWriter, moving: MovingFrame, steps: Steps, poses: M
         in_ros = ros_covariance(adjoint @ covariance @ adjoint.T, T_odom_frame)
         data = pack_odometry(stamp_ns, _ODOM, moving.name, here, in_ros)
         writer.append("/odometry", "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
-
-
-def _rows(points: Points) -> NDArray[np.void]:
-    """Points (N, d) as rows of x, y, z; in 2D, z is 0."""
-    return lie.lift_points(points).astype("<f4").view([(name, "<f4") for name in "xyz"])[:, 0]

@@ -29,8 +29,6 @@ from scanchain.threads import threads
 from scanchain.trajectory import write_wide_tum
 from scanchain.verdict import Judged
 
-_FEW_SCANS = 2  # number of scans up to which a trajectory has at most one motion
-
 
 @dataclass(frozen=True, slots=True)
 class Finished:
@@ -191,7 +189,7 @@ class _Run:
         log, result, (run_s, compile_s) = self.log, results.result, times_s
         stopped = self.source.stopped_after(len(self.steps))
         lost = [*log.damage, *self.notes, *result.warnings, *results.warnings, *of_recording]
-        if len(self.steps) <= _FEW_SCANS:
+        if len(self.steps) <= 2:  # at most one motion
             few = f"a trajectory of {counted(len(self.steps), 'scan')}"
             lost.append(f"{few} says nothing about the log; check --start, --end, --every")
         wheels, truth_topic = log.odometry_topic, log.ground_truth_topic

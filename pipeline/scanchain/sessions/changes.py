@@ -25,8 +25,7 @@ _JOINED_VOXELS = {2: 4.0, 3: 3.0}  # distance within which changed points belong
 _LEAST_POINTS = {2: 3, 3: 6}  # least number of points of a cluster
 _LEG_M, _LEGS_M = 0.2, 1.0  # size of legs of furniture, and distance within which they belong to one piece
 _LEAST_AGREEMENT = 0.4  # least share of unchanged points among those that both maps observed
-_ANGLES = 90  # headings that a box around a cluster is tried at, over 90°
-_ALIKE_SHARE, _ALIKE_VOXELS = 0.1, 1.0  # by which lengths of one object may differ between two views
+_ALIKE = (0.1, 1.0)  # by which lengths of one object may differ between two views: share, and voxels
 _MOVED_SIZES = 5.0  # largest distance at which an object is recognized by its size alone, in lengths of it
 _UNRIVALED = 0.33  # largest ratio of that distance to that of any other cluster of the same size
 _THIN_VOXELS = 1.25  # thickness of a cluster, in voxels, below which it can be a surface that rays grazed
@@ -226,7 +225,7 @@ def _connected(points: Points, chosen: NDArray[np.int64], reach_m: float) -> lis
 
 def _box(points: Points, size_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Center (d,), size (d,) and heading of the upright box of least area around points, enlarged by a voxel."""
-    yaws = np.arange(_ANGLES) * (0.5 * np.pi / _ANGLES)
+    yaws = np.arange(90) * (0.5 * np.pi / 90)
     axes = np.stack([np.cos(yaws), np.sin(yaws), -np.sin(yaws), np.cos(yaws)], axis=-1).reshape(-1, 2, 2)
     turned = axes @ points[:, :2].T
     low, high = turned.min(axis=2), turned.max(axis=2)
@@ -263,4 +262,4 @@ def _paired(clusters: Sequence[Cluster], size_m: float) -> tuple[Cluster, ...]:
 def _alike(a: Cluster, b: Cluster, size_m: float) -> bool:
     """True if the boxes can be two views of the same object."""
     longer = np.maximum(a.size_m, b.size_m)
-    return bool((np.abs(a.size_m - b.size_m) < _ALIKE_SHARE * longer + _ALIKE_VOXELS * size_m).all())
+    return bool((np.abs(a.size_m - b.size_m) < _ALIKE[0] * longer + _ALIKE[1] * size_m).all())

@@ -29,16 +29,12 @@ from scanchain.settings import load_settings
 LAS_SUFFIXES, GRID_SUFFIXES = (".laz", ".las"), (".yaml", ".yml")
 SPACING_M = {2: 1.5, 3: 6.0}  # between the positions of virtual scans
 VIEW_M = {2: 30.0, 3: 50.0}  # range of virtual scans
-_HEIGHT_M = 1.6  # of a lidar above the ground
 _CLEARANCE_M = 0.4  # least distance of a position from any point
-_GROUND_RADIUS_M, _GROUND_PERCENTILE = 2.0, 5.0  # radius; percentile of heights in it that is the ground
+_GROUND = (2.0, 5.0)  # radius in m, and percentile of the heights in it that is the ground
 _BINS = {2: (1, 720), 3: (180, 360)}  # of elevation and azimuth, in which nearer points occlude others
 _HIDDEN_M = 0.5  # distance behind the nearest point of its bin beyond which a point is occluded
-_SECTORS, _LEAST_SECTORS = 36, 0.6  # of azimuth, and least share of them with points at a position in 2D
 _LEAST_POINTS = 100  # least number of points in view of a position
-_FLAT_M = 1e-6  # extent in height of points in the plane
 _MAX_POSITIONS, _MAX_CELLS = 20_000, 2_000_000  # largest numbers of positions, and of those that are tried
-_LEAST_CELL_M, _LARGEST_CELL_M = 1e-3, 1e2  # of a grid
 _PERCENTILE, _OUTLIER = 99.0, 10.0  # of distances from the median; multiple of it beyond which points are outliers
 _COARSE_STEP_M = 0.01  # of coordinates, above which rounding adds to a sensor noise of 3 cm
 _MODES = ("trinary", "scale", "raw")  # of map_server
@@ -72,7 +68,7 @@ def import_map(
     out: Path,
     *,
     spacing_m: float | None = None,
-    height_m: float = _HEIGHT_M,
+    height_m: float = 1.6,
     force: bool = False,
     say: Callable[[str], None] = lambda stage: None,
     command: Sequence[str] = (),
@@ -145,7 +141,7 @@ def _read(file: Path, spacing_m: float | None) -> _Surfaces:
             "there: the map and all poses in it are no more accurate; subtract an offset before they are stored, "
             "or store float64 from the beginning"
         )
-    return _Surfaces(points[:, :2] if np.ptp(points[:, 2]) < _FLAT_M else points, notes=tuple(notes))
+    return _Surfaces(points[:, :2] if np.ptp(points[:, 2]) < 1e-6 else points, notes=tuple(notes))
 
 
 def _without_outliers(points: Points, spacing_m: float) -> Points:
@@ -191,7 +187,7 @@ def _read_grid(file: Path) -> _Surfaces:
         is_negated, mode = bool(int(stated.get("negate", 0))), stated.get("mode", "trinary")
         if mode not in _MODES:
             raise ValueError(f"mode is {shown(mode)}, wanted one of {', '.join(_MODES)}")
-        if not (_LEAST_CELL_M <= resolution_m <= _LARGEST_CELL_M and np.isfinite([x, y, yaw_rad]).all()):
+        if not (1e-3 <= resolution_m <= 1e2 and np.isfinite([x, y, yaw_rad]).all()):
             raise ValueError(f"resolution {resolution_m:g} m, origin {x:g}, {y:g}, {yaw_rad:g}")
     except OSError as error:
         raise InputError(f"{error.filename or file}: cannot be read ({error.strerror or error})") from error
@@ -245,9 +241,9 @@ def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points
 
 def _above_ground(points: Points, grid: Matrix, height_m: float) -> Points:
     """Positions (P, 3) above the ground around positions in the plane, where there is any."""
-    around = KDTree(points[:, :2]).query_ball_point(grid, _GROUND_RADIUS_M)
+    around = KDTree(points[:, :2]).query_ball_point(grid, _GROUND[0])
     rows = [
-        (x, y, float(np.percentile(points[found, 2], _GROUND_PERCENTILE)) + height_m)
+        (x, y, float(np.percentile(points[found, 2], _GROUND[1])) + height_m)
         for (x, y), found in zip(grid.tolist(), around, strict=True)
         if found
     ]
@@ -287,6 +283,6 @@ def _in_view(points: Points) -> Points:
 
 
 def _is_inside(seen: Points) -> bool:
-    """True if 2D points surround the lidar on most sides."""
-    sectors = np.floor((np.arctan2(seen[:, 1], seen[:, 0]) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int)
-    return len(np.unique(np.minimum(sectors, _SECTORS - 1))) >= _LEAST_SECTORS * _SECTORS
+    """True if 2D points surround the lidar: 60 % of 36 sectors of azimuth have some."""
+    sectors = np.floor((np.arctan2(seen[:, 1], seen[:, 0]) / (2.0 * np.pi) + 0.5) * 36).astype(int)
+    return len(np.unique(np.minimum(sectors, 35))) >= 0.6 * 36

@@ -14,12 +14,12 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Pose
+from scanchain.data import DOWNWEIGHTED, Closure, Keyframe, Matrix, Pose
 from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import SequentialPlaceTest, compared
-from scanchain.loops.planar_map_search import PlanarMapSearch
+from scanchain.loops.planar_map_search import AGREE, PATH_M, PlanarMapSearch
 from scanchain.loops.upright_search import MEMBERS, UprightMap
 from scanchain.maps import Edges, SavedMap
 from scanchain.placement import loop_information
@@ -29,11 +29,8 @@ _APART_M = 200.0  # path assumed between the last keyframe of a map and the firs
 _CLEAR = 0.1  # share of a map's keyframes with a closure in force above which it joins before others are tried
 _NEW_M = 5.0  # distance from older keyframes, at full scale, beyond which a keyframe is in a new area
 _NEW_KEYFRAMES = 3  # least number of them for which maps that were not found are searched for again
-_IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
-_MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # least share of contradictions reported, and ratio to that within maps
-_WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
-_PATH_M, _STEP_M = 8.0, 2.0  # length of paths in 2D that are searched for as a whole, and spacing
-_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
+_CHANGE = (0.025, 3.0)  # least share of contradictions that is reported, and its ratio to that within maps
+_STEP_M = 2.0  # spacing of paths in 2D that are searched for as a whole
 _AGREEING = 0.3  # least share of the keyframes of an agreeing path that agree
 _MAX_PATHS = 200  # largest number of such paths; along longer sessions they lie farther apart
 _SEARCHED = 8  # largest number of paths that are searched for elsewhere
@@ -250,8 +247,9 @@ def changed(joined: Joined) -> dict[int, float]:
     parts = {
         number: [joined.keyframes[k] for k in np.flatnonzero(joined.of_map == number)] for number in joined.maps
     }
-    agreeing, contradicting = sum((compared(part, part, _WITHIN_M) for part in parts.values()), np.zeros(2))
-    least = max(_MIN_CHANGE, _TIMES_WITHIN * contradicting / max(agreeing + contradicting, 1))
+    # least path between two keyframes of one map
+    agreeing, contradicting = sum((compared(part, part, 1.0) for part in parts.values()), np.zeros(2))
+    least = max(_CHANGE[0], _CHANGE[1] * contradicting / max(agreeing + contradicting, 1))
     found: dict[int, float] = {}
     for number in joined.maps[1:]:
         others = [k for other, part in parts.items() if other != number for k in part]
@@ -304,7 +302,7 @@ def repeated_paths(
     """
     searches = [PlanarMapSearch(part, config.local_map.voxel_size_m) for part in (host, guest)]
     traveled_m = np.array([keyframe.traveled_m for keyframe in guest]) - guest[0].traveled_m
-    length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
+    length_m = max(min(PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
     step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
     begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
     ends = np.unique(np.searchsorted(traveled_m, [begin_m, begin_m + length_m]), axis=1).T.tolist()
@@ -313,18 +311,15 @@ def repeated_paths(
     for path in paths:
         members = [guest[index] for index in path]
         fits = [fit for search in searches if (fit := search.likely(members)) is not None]
-        away = [lie.apart(fit.T_map_lidar, members[len(members) // 2].T_odom_lidar) for fit in fits]
-        repeated += any(
-            fit.is_ambiguous or off_m >= _AGREE_M or off_rad >= _AGREE_RAD
-            for fit, (off_m, off_rad) in zip(fits, away, strict=True)
-        )
+        T = members[len(members) // 2].T_odom_lidar
+        repeated += any(fit.is_ambiguous or not lie.agree(fit.T_map_lidar, T, *AGREE) for fit in fits)
     return repeated, len(paths)
 
 
 def _joining(joined: Joined, old: int) -> NDArray[np.int64]:
     """Keyframes from ``old`` on that a closure in force joins to those before."""
     pairs = joined.edges.pairs
-    return np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE), 1])
+    return np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > DOWNWEIGHTED), 1])
 
 
 def _overlap(joined: Joined, old: int) -> float:

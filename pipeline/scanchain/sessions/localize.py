@@ -18,7 +18,7 @@ from scanchain.ahead import compile_ahead
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Pose, brief
-from scanchain.errors import InputError, counted
+from scanchain.errors import FIRST, InputError, counted
 from scanchain.logs import Log
 from scanchain.maps import SavedMap
 from scanchain.runs.directory import POINTS_FILE, RunDirectory, write_figures
@@ -35,11 +35,10 @@ from scanchain.verdict import Judged, Verdict, merged
 LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path of a log below which not being found in the map proves nothing
 _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without a match with the map that is reported
-_MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # least reported difference of the live and the final pose of a scan
+_MOVED = (0.3, 5.0)  # m and σ, least reported difference of the live and the final pose of a scan
 _PATHS = 12  # largest number of paths of the log that are searched for elsewhere in the end
 _APART_S = 1.0  # largest time between the first scan and the nearest pose of a file
 _AMBIGUOUS_SHARE = 0.5  # least share of ambiguous searches for which a log that is not found is called ambiguous
-_SHOWN = 3  # largest number of parts that the verdict lists
 
 
 class Part(Struct, frozen=True):
@@ -242,7 +241,7 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
     dimension = found.trajectory.dimension
     after = np.arange(len(found.states)) >= found.found_at
     away_m = np.linalg.norm((found.live - found.trajectory.poses)[:, :-1, -1], axis=1)
-    wrong = found.is_placed & (away_m > np.maximum(_MOVED_M, _MOVED_SIGMAS * found.sigma_m))
+    wrong = found.is_placed & (away_m > np.maximum(_MOVED[0], _MOVED[1] * found.sigma_m))
     kinds = (
         ("not joined to the map", ~found.is_placed, 0.0),
         ("lost", after & found.is_placed & (found.states == MapState.LOST), 0.0),
@@ -306,8 +305,8 @@ def _verdict(
     doubtful = sorted((part for part in parts if part.is_doubtful), key=lambda part: -part.length_m)
     if not doubtful and not doubt:
         return Verdict.TRUSTWORTHY, f"{where}, and tracked: {tried}; {evidence}"
-    more = f"and {len(doubtful) - _SHOWN:,} more" if len(doubtful) > _SHOWN else ""
-    reasons = [where, evidence, doubt, *(part.text for part in doubtful[:_SHOWN]), more]
+    more = f"and {len(doubtful) - FIRST:,} more" if len(doubtful) > FIRST else ""
+    reasons = [where, evidence, doubt, *(part.text for part in doubtful[:FIRST]), more]
     return Verdict.CHECK, "; ".join(filter(None, reasons))
 
 

@@ -99,10 +99,8 @@ def merged_map(
         session[of_session] = new
         sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number][index]))
         trajectories.append(_trajectory(maps[number], index, poses[of_session]))
-    keyframes, in_force = (
-        joined.placed(poses).keyframes,
-        joined.edges.where(joined.edges.weight >= REJECTED_WEIGHT),
-    )
+    keyframes = joined.placed(poses).keyframes
+    in_force = joined.edges.where(joined.edges.weight >= REJECTED_WEIGHT)
     saved = SavedMap(folder, joined.dimension, keyframes, session, tuple(sessions), in_force)
     merged = MergedMap(joined, saved, tuple(trajectories), np.zeros(len(poses), np.int64))
     return updated(merged, config) if update else merged

@@ -19,7 +19,6 @@ from scanchain.simulation.solids import FIXED, Solids
 _VANISHED, _MOVED, _APPEARED = 0.12, 0.15, 0.08  # shares of the objects removed, moved, and copied elsewhere
 _APART_M = (0.5, 4.0)  # meters, range of the distance of a move: within sight of where the object stood
 _TURN_RAD = 0.15  # standard deviation of the turn, in addition to quarter turns
-_TRIES = 20  # number of poses sampled for an object; it stays as it is if none of them is free
 _ROOM_M = 0.05  # least distance from other solids
 _SAMPLE_M = 2.0 * _ROOM_M  # spacing of the points of a footprint: nothing is farther than ``_ROOM_M`` from one
 _HIGHEST_M = 2.0  # solids that begin higher above the ground, such as lintels, overlap with no object
@@ -95,7 +94,7 @@ def _elsewhere(
 ) -> Solids | None:
     """The object at a free pose nearby with nothing fixed in between; None if no such pose was found."""
     here, fixed = _middle(thing), solids.part(solids.owner == FIXED)
-    for _ in range(_TRIES):
+    for _ in range(20):  # it stays as it is if no pose is free
         away_m, direction = rng.uniform(*_APART_M), rng.uniform(0.0, 2.0 * np.pi)
         xy = away_m * np.array([np.cos(direction), np.sin(direction)])
         turn_rad = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, _TURN_RAD)

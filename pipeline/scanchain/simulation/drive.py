@@ -41,9 +41,7 @@ EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan, in November 202
 _PLACE, _DEVIATION, _WHEELS, _RANGES, _IMU, _GNSS = range(6)  # each purpose has random numbers of its own
 _ODOMETRY_PERIOD_NS = 20_000_000  # 50 Hz, as of most robots' drivers
 _DROPOUT_S = 1.0  # seconds without scans at each of the dropouts of a world
-_PATH_STEP_S = 0.1  # between the positions of a drive that objects keep clear of
 _SPARE_M = 0.25  # distance of objects from the drive, beyond the vehicle's half width and deviation
-_LONGEST_S = 36_000.0  # longest drive, 10 h: the plan is in memory
 
 
 class Slip(NamedTuple):
@@ -122,7 +120,7 @@ def plan(
     scene = WORLDS[world]
     lidar = _sensor(sensor or scene.sensor, noise_m, dropout, scene.sight_m)
     length_s = scene.duration_s if duration_s is None else duration_s
-    _check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
+    _check_range("duration_s", length_s, lidar.period_ns * 1e-9, 36_000.0)  # 10 h: the plan is in memory
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
     _check_range("start_m", start_m, 0.0, checks.LARGEST)
     _check_range("drift", drift, 0.0, 100.0)
@@ -146,7 +144,7 @@ def plan(
     motion = moving(rng=_random(seed, _DEVIATION, changed)).at_pace(pace)
     changes: tuple[Change, ...] = ()
     if changed is not None:
-        path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
+        path = motion.base(np.arange(0.0, length_s, 0.1))[:, :2, 3]
         free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m + _SPARE_M
         solids, changes = another_day(solids, path, free_m, _random(seed, _PLACE, changed))
         T_world_map = moving(rng=_random(seed, _DEVIATION)).lidar(np.zeros(1))[0]

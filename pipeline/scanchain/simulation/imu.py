@@ -15,7 +15,6 @@ from scanchain.simulation.motion import Motion
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.81])  # specific force at rest, in the world frame
 _STANDARD_GRAVITY_M_S2 = 9.80665  # the unit g
 _STEP_S = 1e-3  # of the differences of poses
-_BLOCK = 20_000  # samples whose poses are in memory at a time
 
 
 def _mount(position_m: tuple[float, float, float], yaw_pitch_roll_deg: tuple[float, float, float]) -> Matrix:
@@ -64,7 +63,7 @@ class ImuModel:
 
     def measure(self, motion: Motion, instants_s: NDArray[np.floating], rng: np.random.Generator) -> ImuSamples:
         """Samples (N,) along a motion, ``period_ns`` apart."""
-        blocks = np.array_split(instants_s, len(instants_s) // _BLOCK + 1)
+        blocks = np.array_split(instants_s, len(instants_s) // 20_000 + 1)  # their poses are in memory
         rates, forces = map(np.vstack, zip(*(self._true(motion, block) for block in blocks), strict=True))
         rates += self._disturbed(self.gyro, len(rates), rng)
         forces += self._disturbed(self.accelerometer, len(forces), rng)

@@ -22,7 +22,7 @@ _SWAY_HERTZ = np.array([1.3, 0.9, 1.1, 0.8, 0.6])  # heave, roll, pitch, sideway
 _SCALE_SHARE = 0.01  # relative error of the distance: the wheels are not of the assumed size
 _TURN_SHARE = 0.02  # relative error of the angle: the wheels are not at the assumed distance
 _BIAS_RAD_PER_M = 0.0005  # turn per meter, because one wheel is larger than the other
-_NOISE_M, _NOISE_RAD = 0.01, 0.004  # slip along the path and in heading, standard deviations per √m
+_NOISE = (0.01, 0.004)  # m and rad per √m, standard deviations of the slip along the path and in heading
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,9 +143,9 @@ def wheel_odometry(
     scale, turn, bias = drift * rng.choice([-1.0, 1.0], 3) * rng.uniform(0.5, 1.5, 3)
     noise = drift * np.sqrt(traveled)[:, None] * rng.standard_normal((len(steps), 2))
     moved = steps[:, :2, 2] * (1.0 + scale * _SCALE_SHARE)
-    moved[:, 0] += _NOISE_M * noise[:, 0] + slips_m
+    moved[:, 0] += _NOISE[0] * noise[:, 0] + slips_m
     turned = (
-        lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * traveled + _NOISE_RAD * noise[:, 1]
+        lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * traveled + _NOISE[1] * noise[:, 1]
     )
     poses = lie.exp(np.outer(np.concatenate([[0.0], np.cumsum(turned)]), [0.0, 0.0, 1.0]))  # at the origin
     c, s = poses[:-1, 0, 0], poses[:-1, 1, 0]

@@ -12,14 +12,13 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from scanchain.data import LEAST_FIT, Matrix
+from scanchain.errors import FIRST
 
 Floats = NDArray[np.float64]
 
 KNOWN = 0.5  # least share of scans with a value of another sensor for it to count as known
-_GAP_SCANS = 10  # largest number of scans without a finding within a segment
 _LONG_GAP = 3.0  # multiple of the median interval above which the motion is not predicted
 _SMALL_RAD = 0.1  # difference of headings below which the text leaves it out
-_SHOWN = 3  # number of segments that a reason lists
 
 
 class Kind(StrEnum):
@@ -246,7 +245,7 @@ class Check:
         yield from ()
 
 
-def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
+def merged(is_marked: NDArray[np.bool_], gap: int = 10) -> list[slice]:
     """Runs of marked scans, joined over up to ``gap`` unmarked ones."""
     places = np.flatnonzero(is_marked)
     parts = np.split(places, np.flatnonzero(np.diff(places) > gap + 1) + 1)
@@ -255,7 +254,7 @@ def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
 
 def listed(segments: Sequence[Segment]) -> str:
     """The largest segments in words, and how many more there are."""
-    largest = sorted(segments, key=lambda each: (each.size_m or 0.0, each.scans), reverse=True)[:_SHOWN]
+    largest = sorted(segments, key=lambda each: (each.size_m or 0.0, each.scans), reverse=True)[:FIRST]
     more = len(segments) - len(largest)
     return "; ".join(each.text for each in largest) + (f"; and {more:,} more" if more else "")
 

@@ -17,7 +17,7 @@ from scanchain.verdict.evidence import Evidence, Segment, extent_m, listed
 
 _REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # largest extent, rotation and mean speed at rest
 _MOST_OPEN_AT_REST = 0.05  # largest share of unconstrained or contradicted scans from which a rest is concluded
-_WORKABLE, _WORKABLE_M = 0.03, 0.1  # largest upper bound of the error: share of the trajectory's extent, or meters
+_WORKABLE = (0.03, 0.1)  # largest upper bound of the error: share of the trajectory's extent, or meters
 _MORE = re.compile(r"and [\d,]+ more")
 
 
@@ -111,7 +111,7 @@ def _whole(evidence: Evidence, rest: _Rest) -> Iterator[str]:
     """Reasons to check that concern the whole: whether it moves, and an error that is unknown or large."""
     if rest.is_there and not rest.is_shown:
         yield rest.text
-    limit_m = max(_WORKABLE * rest.extent_m, _WORKABLE_M)
+    limit_m = max(_WORKABLE[0] * rest.extent_m, _WORKABLE[1])
     if rest.is_shown or evidence.bound_m <= limit_m:
         return
     if not np.isfinite(evidence.bound_m):

@@ -15,8 +15,7 @@ from scanchain.verdict.evidence import Check, Closures, Evidence, Floats, Kind, 
 
 _LEAST_M = 0.5  # least translation error of a closure that is a contradiction
 _NEAR_M = 10.0  # largest path between two closures of a group, summed over both ends
-_AGREE_M, _AGREE_SHARE = 0.2, 0.02  # largest difference of two that agree: meters, and share of that path
-_FINDABLE = 3000  # largest number of contradicting closures that are grouped; of more, every n-th
+_AGREE = (0.2, 0.02)  # largest difference of two that agree: meters, and share of that path
 _FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # least number of scans that tried closures; closures accepted per scan
 
 
@@ -79,7 +78,7 @@ def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> 
     off = lie.between(expected, closures.T_target_source)[:, :-1, -1]
     size_m = np.linalg.norm(off, axis=1)
     chosen = np.flatnonzero(size_m > _LEAST_M)
-    chosen = chosen[:: max(1, -(-len(chosen) // _FINDABLE))]
+    chosen = chosen[:: max(1, -(-len(chosen) // 3000))]  # more would take long
     if len(chosen) < FEWEST:
         return []
     edges, T = np.stack([closures.target, closures.source], axis=1)[chosen], closures.T_target_source[chosen]
@@ -88,7 +87,7 @@ def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> 
 
     def agree(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:
         off_m = np.linalg.norm((carried(poses, edges[a], T[a], edges[b]) - T[b])[:, :-1, -1], axis=1)
-        return off_m < _AGREE_M + _AGREE_SHARE * np.abs(along_m[a] - along_m[b]).sum(axis=1)
+        return off_m < _AGREE[0] + _AGREE[1] * np.abs(along_m[a] - along_m[b]).sum(axis=1)
 
     pairs = KDTree(along_m).query_pairs(_NEAR_M, p=1, output_type="ndarray")
     groups = []

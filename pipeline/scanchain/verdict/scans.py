@@ -10,25 +10,22 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from scanchain import lie
-from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
+from scanchain.data import LEAST_FIT, MOST_COPIES, SIMILAR_INTERVALS, Matrix
 from scanchain.verdict.evidence import Check, Evidence, Floats, Kind, Segment, listed, merged
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
 _MOST_PREDICTED = 0.5  # largest share of scans with a predicted pose that nothing confirms
 _MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
 _FEW_POINTS = 100  # number of points below which a scan is sparse; scans of planar lidars have more
-_PASSED_M = 1.0  # largest harmless extent of a segment of predicted or contradicted poses
-_PASSED_CONFIRMED_M = 4.0  # the same where another sensor agrees with the trajectory
+# largest harmless extent of a segment of predicted or contradicted poses; of one that another sensor confirms
+_PASSED_M = (1.0, 4.0)
 _MEDIAN_SCANS = 9  # window of the median of ``fit``; moving people contradict single scans
-_GAP_CONTRADICTED = 10  # largest number of scans that fit between contradicted ones of a segment
 
 _LEAST_OVERLAP = 2.0 / 3.0  # smallest accepted ratio of the inlier share to the usual one
-_FEWEST, _BEFORE = 3, 10  # least and largest number of previous scans whose median is the usual share
-_LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
+_PREVIOUS = (3, 10)  # least and largest number of previous scans whose median is the usual share
 
-_ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands reach
-_MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of the motion between two scans by scan matching
-_SIMILAR = 1.4  # largest ratio of the usual interval to one that is used; shorter ones are due to jittering stamps
+_ACCELERATION = (4.0, 12.0)  # m/s² and rad/s², σ: a fifth to a third of what vehicles and hands reach
+_MOTION = (0.05, 0.01)  # m and rad, σ of the motion between two scans by scan matching
 _LARGE_M = 1.0  # jump above which the trajectory is wrong
 
 _RESTING_M = 0.05  # largest distance from copies to the next scan at which the lidar was at rest
@@ -100,9 +97,9 @@ def _of_state(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> I
     scans: the map that it is matched to contains these at wrong poses.
     """
     for part in merged(is_marked):
-        inner = merged(is_marked[part], 0 if kind is not Kind.CONTRADICTED else _GAP_CONTRADICTED)
+        inner = merged(is_marked[part]) if kind is Kind.CONTRADICTED else merged(is_marked[part], 0)
         runs = [slice(part.start + run.start, part.start + run.stop) for run in inner]
-        limits_m = [_PASSED_CONFIRMED_M if evidence.is_confirmed_throughout(run) else _PASSED_M for run in runs]
+        limits_m = [_PASSED_M[evidence.is_confirmed_throughout(run)] for run in runs]
         if any(_extent_m(evidence, run, kind) > limit_m for run, limit_m in zip(runs, limits_m, strict=True)):
             counted = evidence.is_contradicted if kind is Kind.CONTRADICTED else is_marked
             yield evidence.segment(kind, part, counted)
@@ -142,9 +139,10 @@ def check_overlap(inlier_share: Floats) -> Floats:
     usual = np.full(len(inlier_share), np.nan)
     if not np.isfinite(inlier_share).any():
         return usual
-    padded = np.append(np.full(_BEFORE, np.nan), inlier_share)  # the first scans have fewer previous ones
-    usual[_FEWEST:] = np.nanmedian(sliding_window_view(padded, _BEFORE)[_FEWEST:-1], axis=1)
-    return inlier_share / np.maximum(usual, _LEAST_USUAL)
+    fewest, most = _PREVIOUS
+    padded = np.append(np.full(most, np.nan), inlier_share)  # the first scans have fewer previous ones
+    usual[fewest:] = np.nanmedian(sliding_window_view(padded, most)[fewest:-1], axis=1)
+    return inlier_share / np.maximum(usual, 1e-3)
 
 
 class Velocity(Check):
@@ -191,29 +189,25 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
     clocks.append(np.full(n - 1, usual_s))
     best = np.full(n - 2, np.inf)
     for interval_s in clocks:
-        plausible_s = np.maximum(interval_s, usual_s / _SIMILAR)
+        plausible_s = np.maximum(interval_s, usual_s / SIMILAR_INTERVALS)
         before, after = plausible_s[:-1], plausible_s[1:]
         change = motions[1:] - (after / before)[:, None] * motions[:-1]
         span_s2 = 0.5 * after * (before + after)
-        sigma_m = _sigma_m(span_s2)
-        sigma_rad = np.hypot(_ACCELERATION_RAD_S2 * span_s2, _MOTION_RAD)
-        best = np.minimum(
-            best,
-            np.maximum(
-                np.linalg.norm(change[:, :d], axis=1) / sigma_m, np.linalg.norm(change[:, d:], axis=1) / sigma_rad
-            ),
-        )
+        parts = (change[:, :d], change[:, d:])
+        apart = [np.linalg.norm(part, axis=1) / _sigma(span_s2, k) for k, part in enumerate(parts)]
+        best = np.minimum(best, np.maximum(*apart))
     innovation[2:] = best
     return innovation
 
 
 def smallest_jump_m(seconds: Floats) -> float:
     """Smallest jump of a position that ``check_velocity`` detects at the median interval of times (N,)."""
-    return Velocity.limit * float(_sigma_m(np.median(np.diff(seconds)) ** 2)) if len(seconds) > 1 else np.inf
+    return Velocity.limit * float(_sigma(np.median(np.diff(seconds)) ** 2)) if len(seconds) > 1 else np.inf
 
 
-def _sigma_m(span_s2: Floats | float) -> Floats:
-    return np.hypot(_ACCELERATION_M_S2 * span_s2, _MOTION_M)
+def _sigma(span_s2: Floats | float, part: int = 0) -> Floats:
+    """Standard deviation of a change of motion: of its translation (0) or its rotation (1)."""
+    return np.hypot(_ACCELERATION[part] * span_s2, _MOTION[part])
 
 
 class Copies(Check):

@@ -19,28 +19,24 @@ from scanchain.verdict.evidence import KNOWN, Check, Closures, Evidence, Floats,
 
 WINDOW_M = 4.0  # path over which wheels and trajectory are compared
 _SHORTEST_M = 0.5  # shortest path of a window that is checked
-_TURN_M_RAD = 0.5  # path length per rad of rotation
 _SPUN_M = 0.5  # largest path per scan counted from the wheels alone: a longer one is slip or a wrong reading
 _GRID_M, _MEDIAN = 0.1, 21  # median filter along the path: spacing and number of samples
 
 _LARGEST_CORRECTION = 0.1  # m/m and rad/m: limit of the correction by the calibration of the wheels
-_RIDGE = 1e-3  # regularization of the calibration, for directions in which the wheels never moved
-_ROUNDS = 10  # iterations of the robust regression
 _WILD = 2.0  # m/m and rad/m: errors of the wheels above which a window is left out of the calibration
-_LEAST_M, _LEAST_RAD = 0.05, 0.03  # smallest σ of the wheels over a window
-_LEAST_SHARE, _MOST_SHARE = 0.02, 0.05  # m/m and rad/m: limits of the learned σ of the wheels
-_TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals that gives σ, and its value for a standard normal
+_LEAST_SIGMAS = (0.05, 0.03)  # m and rad, smallest of the wheels over a window
+_SHARES = (0.02, 0.05)  # m/m and rad/m: limits of the learned σ of the wheels
 
 _MEDIAN_LIMIT = 2.0  # largest median innovation; about 1 where calibration and σ are right
 _LEAST_TURN_RAD = 1.0  # rotation of the wheels over a log below which its direction is not compared
-_OPPOSED = -0.5  # ratio of the rotations of trajectory and wheels below which one of the two is mirrored
 _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
 
-_FEWEST, _MOST = 3, 20  # least and largest number of closures around a segment that decide; the shortest are used
+_CLOSURES = (3, 20)  # least and largest number of those around a segment that decide; the shortest are used
 _MOST_PARTS = 8  # largest number of segments within a closure; one with more is not used
 _RATIO = 1.0 / 3.0  # largest ratio of the residual with the right source to that with the wrong one
-_EXPLAINED = 0.5  # least share of a disagreement left by the wrong source, or explained by a jump of the wheels
-_CONFIRMED = 0.5  # least share of a contradiction by loop closures that the wheels must confirm
+# least share of a disagreement that the wrong source leaves, that a jump of the wheels explains, or, of one with
+# loop closures, that the wheels confirm
+_EXPLAINED = 0.5
 _IMPOSSIBLE_M = 1.0  # smallest change of the wheels' motion from scan to scan that is a jump
 
 
@@ -87,7 +83,7 @@ class Wheels(Check):
         matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))
         wheels[ends] = lie.log(lie.between(self.poses[ends - 1], self.poses[ends]))
         single_m = np.maximum(_lengths(matched[:, :d]), np.minimum(_lengths(wheels[:, :d]), _SPUN_M))
-        single_m += _TURN_M_RAD * np.maximum(_lengths(matched[:, d:]), _lengths(wheels[:, d:]))
+        single_m += hand_eye.TURN_M_RAD * np.maximum(_lengths(matched[:, d:]), _lengths(wheels[:, d:]))
         path_m = np.cumsum(single_m)
         first = np.searchsorted(path_m, path_m - 0.5 * WINDOW_M, side="left")
         last = np.searchsorted(path_m, path_m + 0.5 * WINDOW_M, side="right") - 1
@@ -101,18 +97,16 @@ class Wheels(Check):
         self.turn_ratio = _turn_ratio(matched[:, d:], wheels[:, d:], first, last)
         inputs, outputs = np.column_stack([wheels, single_m]), matched - wheels
         innovation = np.zeros(len(checked))
-        for part, apart, least in (
-            (slice(0, d), self.apart_m, _LEAST_M),
-            (slice(d, None), self.apart_rad, _LEAST_RAD),
-        ):
+        of_both = (slice(0, d), slice(d, None)), (self.apart_m, self.apart_rad), _LEAST_SIGMAS
+        for part, apart, least in zip(*of_both, strict=True):
             calibration = _calibration(_over(inputs, first, last), _over(outputs[:, part], first, last), length_m)
             correction = inputs @ calibration
             largest = _LARGEST_CORRECTION * single_m / np.maximum(_lengths(correction), 1e-12)
             difference = outputs[:, part] - correction * np.minimum(1.0, largest)[:, None]
             drift = _smoothed(np.cumsum(difference, axis=0), path_m)
             apart[checked] = _lengths(drift[last] - drift[first])
-            share = np.percentile(apart[checked] / length_m, _TAIL) / _TAIL_SIGMAS
-            sigma = np.hypot(least, np.clip(share, _LEAST_SHARE, _MOST_SHARE) * length_m)
+            share = np.percentile(apart[checked] / length_m, 90.0) / 1.645  # as of a normal distribution
+            sigma = np.hypot(least, np.clip(share, *_SHARES) * length_m)
             innovation = np.maximum(innovation, apart[checked] / sigma)
         self.values[checked] = innovation
 
@@ -146,7 +140,7 @@ class Wheels(Check):
                 yield f"{slip.text}, at scans that are not well measured: {cause.kind}"
         loops = [each for each in segments if each.kind == Kind.LOOPS]
         for loop, slip in product(loops, slips):
-            is_confirmed = (slip.size_m or 0.0) > _CONFIRMED * (loop.size_m or 0.0)
+            is_confirmed = (slip.size_m or 0.0) > _EXPLAINED * (loop.size_m or 0.0)
             if is_confirmed and slip.overlaps(loop):
                 yield (
                     f"{slip.text}, and {counted(loop.scans, 'loop closure')} between scans {loop.first:,} and "
@@ -156,7 +150,7 @@ class Wheels(Check):
 
     def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Wheels that turn opposite, or that disagree throughout by more than the largest σ learned for them."""
-        if self.turn_ratio < _OPPOSED:
+        if self.turn_ratio < -hand_eye.OPPOSED:
             yield (
                 "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down "
                 "that /tf_static does not state so: --log.upside_down true), or the wheels are"
@@ -240,8 +234,9 @@ def _calibration(inputs: Matrix, outputs: Matrix, length_m: Floats) -> Matrix:
     A, B = inputs / length_m[:, None], outputs / length_m[:, None]
     weight = (_lengths(B) < _WILD).astype(np.float64)
     correction: Matrix = np.zeros((A.shape[1], B.shape[1]))
-    for _ in range(_ROUNDS):
-        H = (A * weight[:, None]).T @ A + _RIDGE * len(A) * np.eye(A.shape[1])
+    ridge = 1e-3 * len(A) * np.eye(A.shape[1])  # for directions in which the wheels never moved
+    for _ in range(10):
+        H = (A * weight[:, None]).T @ A + ridge
         correction = np.linalg.solve(H, (A * weight[:, None]).T @ B).astype(np.float64, copy=False)
         error = _lengths(B - A @ correction)
         weight = 1.0 / (1.0 + (error / max(1.5 * float(np.median(error)), 1e-3)) ** 2) * (weight > 0.0)
@@ -285,7 +280,7 @@ def which_slipped(
             found.append((Kind.WHEELS_SLIP, size_m))
             continue
         around = np.flatnonzero(closures.is_accepted & (low <= first) & (high >= last))
-        around = around[np.argsort(high[around] - low[around], kind="stable")][:_MOST]
+        around = around[np.argsort(high[around] - low[around], kind="stable")][: _CLOSURES[1]]
         left = []
         for closure in around.tolist():
             within = np.flatnonzero((ends[:, 0] >= low[closure]) & (ends[:, 1] <= high[closure]))
@@ -309,7 +304,7 @@ def _left_m(off: Floats, apart: Floats, is_this: Floats) -> tuple[float, float]:
 
 def _decided(left_m: Floats, size_m: float) -> Kind:
     """Kind of slip from residuals (C, 2, 2) of closures: rest by scans or wheels, part by scans or wheels."""
-    if len(left_m) < _FEWEST:
+    if len(left_m) < _CLOSURES[0]:
         return Kind.WHEELS
     by_scans, by_wheels = np.median(left_m, axis=0).T
     for right, wrong, slipped in ((by_scans, by_wheels, Kind.WHEELS_SLIP), (by_wheels, by_scans, Kind.SCANS_SLIP)):

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 FONT = 8.0  # height of text in points
-_DIGIT = 0.64  # width of a digit as a fraction of the text height
 GAP = 4.0  # least distance between two texts in points
 MARGIN = 0.05  # margin on either side, as a fraction of the range of the values
 _MOST = 10  # largest number of ticks
@@ -21,7 +20,7 @@ _TINY = 1e-9  # share of a step by which the end of a range may miss a tick
 
 def width_of(text: str) -> float:
     """Width of a number in points."""
-    return _DIGIT * FONT * len(text)
+    return 0.64 * FONT * len(text)  # width of a digit over the height of text
 
 
 class Axis:

@@ -33,15 +33,10 @@ THIN = 0.8  # width of a dotted line in points
 DOTS, DASHED = (1.0, 1.5), (3.0, 3.0)  # lengths of dashes and gaps, in widths of the line
 MIDDLE = (0.5, 99.5)  # percentiles of values that are shown at least
 _INCH = 72.0  # points, the unit of the drawing
-_LOWEST = 1.5  # least height of a plan in inches
 _TICK = 3.5  # length of a tick, and its distance from the number, in points
 _ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # height of text above and below its baseline
-_SAME = 0.1  # points; successive positions of a line that are closer are merged
-_FAR = 1e5  # points beyond which nothing is drawn
-_LEVEL = 3  # PNG compression: a higher level takes twice as long and saves a tenth
 _FRAME = "#cccccc"  # of axes on white
 _PANEL_INCHES = (2.0, 12.0)  # least and greatest height of a figure in a PNG
-_TITLE_INCHES = 0.77  # room for its title and labels
 
 
 class Layout(NamedTuple):
@@ -117,7 +112,7 @@ class Plot:
         left, right, bottom, top = _MARGINS
         room = width - left - right
         if shape[0]:
-            height = float(np.clip(room * shape[1] / shape[0] + bottom + top, _LOWEST, highest))
+            height = float(np.clip(room * shape[1] / shape[0] + bottom + top, 1.5, highest))  # in inches
         room = _INCH * np.array([room, height - bottom - top])
         self.size = _INCH * width, _INCH * height
         self.extent = np.min(room / shape) * shape if shape[0] else room
@@ -187,7 +182,8 @@ class Plot:
             (left, right), (bottom, top) = self._at(np.array([low[0], high[0]]), np.array([low[1], high[1]])).T
             picture, file = Image.fromarray(pixels[::-1] if top < bottom else pixels), BytesIO()
             picture.putpalette(palette[:, :3].tobytes())
-            picture.save(file, "PNG", compress_level=_LEVEL, transparency=palette[:, 3].tobytes())
+            # a higher one takes twice as long and saves a tenth
+            picture.save(file, "PNG", compress_level=3, transparency=palette[:, 3].tobytes())
             data = b64encode(file.getvalue()).decode("ascii")
             return (
                 f'<image x="{left:.2f}" y="{min(bottom, top):.2f}" width="{right - left:.2f}" '
@@ -264,7 +260,7 @@ class Plot:
     def _at(self, x: Floats, y: Floats) -> Floats:
         """Positions (N, 2) in points from the upper left corner of the axes."""
         places = np.stack([self.x.fractions(x), 1.0 - self.y.fractions(y)], axis=1) * self.extent
-        return np.clip(places, -_FAR, _FAR)
+        return np.clip(places, -1e5, 1e5)  # points, beyond which nothing is drawn
 
 
 def _stroke(color: str, width: float, dashes: Sequence[float] = ()) -> str:
@@ -279,7 +275,7 @@ def _text(x: float, y: float, text: str, anchor: str = "middle", turned: str = "
 def _path(points: Floats) -> str:
     """SVG path through points (N, 2), broken where they are NaN."""
     moves = np.ones(len(points), bool)
-    moves[1:] = (np.diff(np.rint(points / _SAME), axis=0) != 0.0).any(axis=1)  # NaN is unequal
+    moves[1:] = (np.diff(np.rint(points / 0.1), axis=0) != 0.0).any(axis=1)  # points; NaN is unequal
     known = ("" if x + y != x + y else f"L{x:.2f} {y:.2f}" for x, y in points[moves].tolist())
     return "".join("M" + "".join(run)[1:] for is_known, run in groupby(known, bool) if is_known)
 
@@ -308,7 +304,7 @@ def write_png(path: Path, panels: Sequence[tuple[str, Plot]], *, width_inches: f
 
     shapes = [plot.proportions for _, plot in panels]
     height_inches = np.clip(width_inches * max(height / width for width, height in shapes), *_PANEL_INCHES)
-    size = len(panels) * width_inches, float(height_inches) + _TITLE_INCHES
+    size = len(panels) * width_inches, float(height_inches) + 0.77  # room for title and labels
     figure, named = Figure(figsize=size, layout="constrained"), {}
     for axes, (title, plot) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for draw in plot.on_axes:

@@ -33,7 +33,6 @@ VIRIDIS = (
 )  # fmt: skip
 _REACH = 0.5  # share of the range of ``MIDDLE`` beyond which a point of a map is an outlier
 _ALL_BUT_FEW = (0.05, 99.95)  # percentiles of the other points that are shown
-_PNG_INCHES = 8.0  # width of a PNG
 _NO_POINTS = np.empty((0, 3))
 _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of 3D points, by height
 
@@ -130,10 +129,8 @@ def draw_points(
     if not len(points):
         return
     colors = colors if len(colors) == 1 or np.ptp(points[:, 2]) else (GRAY,)
-    size_m, width = (
-        float(high[0] - low[0]),
-        float(np.clip(_STYLE.pixels_per_root * np.sqrt(len(points)), *_STYLE.widths)),
-    )
+    size_m = float(high[0] - low[0])
+    width = float(np.clip(_STYLE.pixels_per_root * np.sqrt(len(points)), *_STYLE.widths))
     edge_m = max(grain_m, size_m / _STYLE.widths[1]) if grain_m else size_m / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
@@ -192,7 +189,7 @@ def draw_map(
     corners = [line.positions[:, :2] for line in lines] + ([np.array(extent(seen))] if len(seen) else [])
     low, high = around(np.concatenate(corners))
     figure = over_map(lines, points, low, high, grid=grid, colors=_INKS, path=path)
-    write_png(picture, [(title, figure)], width_inches=_PNG_INCHES)
+    write_png(picture, [(title, figure)], width_inches=8.0)
 
 
 def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:

@@ -22,8 +22,6 @@ from scanchain.steps import STAGES
 from scanchain_viz.colors import ODOMETRY, OPTIMIZED, color_of
 from scanchain_viz.pictures.figure import Floats, around
 
-_LEAST_Z_M = 0.1  # least margin of heights, which vary less than positions in the plane
-
 
 @dataclass(frozen=True, slots=True)
 class DrawnTrajectory:
@@ -55,7 +53,7 @@ class DrawnTrajectory:
 def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> Floats:
     """Corners (2, 3) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
     held = np.concatenate([each.positions for each in trajectories]) if truth is None else truth
-    return np.hstack([around(held[:, :2]), around(held[:, 2:], _LEAST_Z_M)])
+    return np.hstack([around(held[:, :2]), around(held[:, 2:], 0.1)])  # heights vary less
 
 
 def trajectories_of_run(

@@ -19,10 +19,7 @@ from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
 
 _MAX_SCANS, _MAX_BYTES = 256, 4_000_000  # a batch of scans that is written at once: number and size at most
-_MAX_WAIT_S = 0.25  # longest time until a scan is written, so that a viewer follows
-_LEAST_DRAWN = 1e-3  # smaller observability is drawn as this
 WARNING, _INFORMATION = "WARN", "INFO"  # rerun's log levels
-_GROWTH = 1.05  # growth factor between two drawings: the recording's size stays linear in the log's length
 
 
 class KeyframeGraph:
@@ -65,7 +62,7 @@ class KeyframeGraph:
     @property
     def has_grown(self) -> bool:
         """True if it is time to draw it."""
-        return len(self.positions) > _GROWTH * self.drawn
+        return len(self.positions) > 1.05 * self.drawn  # so that the size stays linear in the log's length
 
     def draw(self, times: Times) -> list[Message]:
         """Messages that draw the current graph; none if it is already drawn."""
@@ -81,7 +78,9 @@ class KeyframeGraph:
             return nodes[np.array(pairs, np.int64).reshape(-1, 2)]
 
         accepted = self._of(ClosureVerdict.ACCEPTED)
-        colors = [entities.PALE_GREEN if item.weight < DOWNWEIGHTED else entities.GREEN for item in accepted]
+        colors = [
+            entities.Color.PALE_GREEN if item.weight < DOWNWEIGHTED else entities.Color.GREEN for item in accepted
+        ]
         return [
             Message(entities.KEYFRAMES, drawing.dots(nodes), times),
             Message(entities.ODOMETRY_EDGES, drawing.lines([nodes]), times),
@@ -144,7 +143,7 @@ class Batcher:
             points = drawing.at_most(step.local_map, self.config.max_map_points)
             messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
         is_large = len(self.gathered) >= _MAX_SCANS or self.bytes >= _MAX_BYTES
-        is_due = is_large or perf_counter() - self.started_s >= _MAX_WAIT_S
+        is_due = is_large or perf_counter() - self.started_s >= 0.25  # so that a viewer follows
         return [*messages, *self.messages()] if is_due else messages
 
     def messages(self) -> list[Message]:
@@ -234,7 +233,7 @@ def _plots(steps: Sequence[Step], times: Times) -> Iterator[Message]:
         entities.INLIERS: [match.inliers for match in matches],
         entities.INLIER_SHARE: [match.inlier_share for match in matches],
         entities.RESIDUAL: [match.residual_m for match in matches],
-        entities.OBSERVABILITY: [math.log10(max(match.observability, _LEAST_DRAWN)) for match in matches],
+        entities.OBSERVABILITY: [math.log10(max(match.observability, 1e-3)) for match in matches],
         entities.ITERATIONS: [match.iterations for match in matches],
     }
     for entity, values in figures.items():

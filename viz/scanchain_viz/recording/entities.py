@@ -59,15 +59,8 @@ SERIES = {  # plots of one series each, and their names
     ITERATIONS: "iterations",
 }
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
-
-YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
-BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
-CYAN, PALE_GREEN = (70, 210, 210), (190, 240, 160)
-
 _HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
 
-_BACKGROUND = (13, 16, 17)  # of scenes, also in a light viewer: lines of ground truth are white
-_PLAY_S = 30.0  # seconds in which a recording is played
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, except in the first scans, which load the kernels
 
 # a list, since the viewer wraps its lines but cuts off those of a table
@@ -98,6 +91,18 @@ back.
 UP = Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 
+class Color:
+    """Colors of the scenes, RGB."""
+
+    YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
+    BLUE = (70, 150, 255)
+    GREEN = (60, 200, 90)
+    RED = (235, 70, 60)
+    ORANGE = (255, 140, 40)
+    VIOLET = (190, 120, 255)
+    CYAN, PALE_GREEN = (70, 210, 210), (190, 240, 160)
+
+
 def height_colors(points: Floats) -> NDArray[np.uint8]:
     """Colors (N, 3) of points (N, 3) by height, from the 2nd to the 98th percentile."""
     return between(_HEIGHT_COLORS, height_shares(points[:, 2]))
@@ -106,26 +111,29 @@ def height_colors(points: Floats) -> NDArray[np.uint8]:
 def constants(dimension: int) -> list[Message]:
     """Static messages: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
-    stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
+    stages = rr.SeriesLines(
+        names=[f"{stage} [ms]" for stage in STAGES],
+        colors=[Color.CYAN, Color.GREEN, Color.BLUE, Color.YELLOW, Color.RED],
+    )
     marked = [rgb(SEGMENT_COLORS[kind]) for kind in (Kind.CONTRADICTED, Kind.DEGENERATE, Kind.LOST)]
-    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, *marked])
+    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[Color.GREEN, *marked])
     return [
         UP,
         Message(LIDAR, rr.TransformAxes3D(axis_length=size_m)),
-        Message(SCAN, dots(color=YELLOW, radius=2.0)),
-        Message(LOCAL_MAP, dots(color=GRAY, radius=1.2)),
-        Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[VIOLET], line_radii=pixels(1.0))),
-        Message(ODOMETRY, lines(color=ORANGE, radius=1.0)),
-        Message(TRAJECTORY, lines(color=BLUE, radius=1.5)),
-        Message(KEYFRAMES, dots(color=VIOLET, radius=2.0)),
-        Message(ODOMETRY_EDGES, lines(color=GRAY, radius=0.75)),
+        Message(SCAN, dots(color=Color.YELLOW, radius=2.0)),
+        Message(LOCAL_MAP, dots(color=Color.GRAY, radius=1.2)),
+        Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[Color.VIOLET], line_radii=pixels(1.0))),
+        Message(ODOMETRY, lines(color=Color.ORANGE, radius=1.0)),
+        Message(TRAJECTORY, lines(color=Color.BLUE, radius=1.5)),
+        Message(KEYFRAMES, dots(color=Color.VIOLET, radius=2.0)),
+        Message(ODOMETRY_EDGES, lines(color=Color.GRAY, radius=0.75)),
         Message(ACCEPTED, lines(radius=1.5)),
-        Message(REJECTED, lines(color=RED, radius=0.75)),
+        Message(REJECTED, lines(color=Color.RED, radius=0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
         Message(VERDICT, rr.TextDocument("The verdict is available at the end of the run.")),
         Message(TIME, stages),
-        *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in SERIES.items()),
-        Message(LOOPS, rr.SeriesLines(names=["accepted", "rejected"], colors=[GREEN, RED])),
+        *(Message(entity, rr.SeriesLines(names=[name], colors=[Color.BLUE])) for entity, name in SERIES.items()),
+        Message(LOOPS, rr.SeriesLines(names=["accepted", "rejected"], colors=[Color.GREEN, Color.RED])),
         Message(STATE, states),
     ]
 
@@ -167,7 +175,7 @@ def with_panels(root: rrb.Container | rrb.View, *, scans: int = 0, has_toggles: 
     """Views with collapsed panels around them; with ``has_toggles`` the list of entities is expanded."""
     return rrb.Blueprint(
         root,
-        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S)),
+        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / 30.0)),  # in 30 s
         rrb.BlueprintPanel(state="expanded" if has_toggles else "collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
@@ -210,7 +218,7 @@ def scene(
         origin=WORLD,
         name=name,
         overrides=overrides,
-        background=_BACKGROUND,
+        background=(13, 16, 17),  # also in a light viewer: lines of ground truth are white
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye,
     )

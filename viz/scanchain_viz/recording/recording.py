@@ -31,7 +31,6 @@ from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import Sink, file_sink, is_readable, open_stream, send_layout, viewer_sink
 
 _LISTED = 50  # largest number of segments in the text of a verdict
-_RADIUS = 3.5  # of a segment's line, in UI points
 
 
 @dataclass(eq=False)
@@ -122,7 +121,7 @@ class Recording:
         """Record the optimized trajectory of all scans."""
         times = Times(np.arange(len(optimized), dtype=np.int64), optimized.stamps_ns)
         self._send(lambda: [
-            _path(entities.OPTIMIZED, optimized.poses, entities.CYAN),
+            _path(entities.OPTIMIZED, optimized.poses, entities.Color.CYAN),
             Message(entities.OPTIMIZED_LIDAR, drawing.transforms(optimized.poses), times),
         ])  # fmt: skip
 
@@ -141,7 +140,7 @@ class Recording:
 
     def log_ground_truth(self, poses: Matrix) -> None:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
-        self._send(lambda: [_path(entities.GROUND_TRUTH, poses, entities.WHITE)])
+        self._send(lambda: [_path(entities.GROUND_TRUTH, poses, entities.Color.WHITE)])
 
     def log_map(self, points: NDArray[np.floating]) -> None:
         """Record the finished map (N, d), downsampled to a third of the points of the scans."""
@@ -184,7 +183,7 @@ class Recording:
         drawn = drawing.at_most(points, max(self.config.max_map_points, self.batcher.points // 3))
         if not len(drawn):
             return []
-        color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
+        color = entities.height_colors(drawn) if self.dimension == 3 else entities.Color.WHITE
         return [Message(entities.MAP, drawing.dots(drawn, color, 1.0))]
 
     def _send(self, say: Callable[[], Iterable[Message]]) -> None:
@@ -254,7 +253,7 @@ def _verdict(judged: Judged, trajectory: Trajectory) -> Iterator[Message]:
     lines = rr.LineStrips3D(
         strips,
         colors=[rgb(color_of_kind(each.kind)) for each in judged.segments],
-        radii=drawing.pixels(_RADIUS),
+        radii=drawing.pixels(3.5),
         labels=[str(each.kind) for each in judged.segments],
         show_labels=False,
     )

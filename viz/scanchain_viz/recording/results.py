@@ -35,9 +35,6 @@ from scanchain_viz.recording.entities import scene, up_to_now, whole_log, with_p
 from scanchain_viz.recording.sinks import write_recording
 from scanchain_viz.report import comparison, maps, problems
 
-_MAP_POINTS = 300_000  # largest number of points of a map in the viewer
-_COMPARED_POINTS = 60_000  # of each method's map
-_HEADROOM = 1.2  # factor over the 99th percentile at which a plot ends
 _PLOTS = (  # name, title, field of a trajectory, factor to the unit
     ("error", "position error [m]", "error_m", 1.0),
     ("time", "time per scan [ms]", "seconds", 1e3),
@@ -51,7 +48,6 @@ _RADII = {  # of points of a map, in UI points: changes stand out
 }
 _FINAL, _SIGMA = "world/final", "plots/sigma"
 _MATCHED, _UNMATCHED = "world/matches/accepted", "world/matches/rejected"
-_MAX_SCAN_POINTS = 5_000  # largest number of points of a scan in a recording of all scans
 
 
 def present_comparison(directory: Path) -> None:
@@ -75,7 +71,7 @@ def _compared(directory: Path, trajectories: Sequence[DrawnTrajectory]) -> Itera
     stamps_ns = scans["stamp_ns"].to_numpy()[first]
     if truth_file.exists():
         path = drawing.positions(read_tum(truth_file).poses)
-        yield Message(entities.GROUND_TRUTH, drawing.lines([path], entities.WHITE, 0.75))
+        yield Message(entities.GROUND_TRUTH, drawing.lines([path], entities.Color.WHITE, 0.75))
     for each in trajectories:
         yield from _of_method(each, method_folder(directory, each.name) / MAP_FILE, stamps_ns)
 
@@ -92,8 +88,8 @@ def _of_method(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: NDArray[n
     yield Message(f"world/{name}/lidar", drawing.dots(color=color, radius=5.0))
     yield Message(f"world/{name}/lidar", places, times)
     if map_file.exists():
-        points = drawing.at_most(read_ply(map_file), _COMPARED_POINTS)
-        red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
+        points = drawing.at_most(read_ply(map_file), 60_000)
+        red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.Color.GRAY, strict=True))
         yield Message(f"world/{name}/map", drawing.dots(points, (red, green, blue), 0.5))
     for plot, _, field, scale in _PLOTS:
         values = scale * getattr(trajectory, field)
@@ -109,7 +105,7 @@ def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
     for plot, name, field, scale in _PLOTS:
         values = np.concatenate([np.empty(0), *(scale * getattr(each, field) for each in trajectories)])
         if np.isfinite(values).any():
-            highest = _HEADROOM * float(np.nanpercentile(values, 99.0))
+            highest = 1.2 * float(np.nanpercentile(values, 99.0))
             legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == "time")
             axes = {"axis_x": whole_log(), "axis_y": rrb.ScalarAxis(range=(0.0, highest))}
             views.append(rrb.TimeSeriesView(origin=f"plots/{plot}", name=name, plot_legend=legend, **axes))
@@ -126,9 +122,9 @@ def present_merge(directory: Path) -> None:
 
 
 def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
-    points = drawing.at_most(read_ply(directory / "map.ply"), _MAP_POINTS)
-    yield Message(entities.MAP, drawing.dots(points, entities.GRAY, 0.75))
-    yield Message(entities.ACCEPTED, drawing.lines(drawn.closures.astype(np.float32), entities.GREEN, 0.75))
+    points = drawing.at_most(read_ply(directory / "map.ply"), 300_000)
+    yield Message(entities.MAP, drawing.dots(points, entities.Color.GRAY, 0.75))
+    yield Message(entities.ACCEPTED, drawing.lines(drawn.closures.astype(np.float32), entities.Color.GREEN, 0.75))
     for session in drawn.sessions:
         color, name = rgb(session.color), rr.escape_entity_path_part(session.name)
         path = session.positions.astype(np.float32)
@@ -196,9 +192,9 @@ def present_localization(directory: Path, localized: LocalizedLog) -> None:
     messages = [
         Message(entities.MAP, drawing.dots(points, entities.height_colors(points), 1.0)),
         Message(entities.LIDAR, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
-        Message(entities.SCAN, drawing.dots(color=entities.YELLOW, radius=2.0)),
+        Message(entities.SCAN, drawing.dots(color=entities.Color.YELLOW, radius=2.0)),
         Message(entities.VERDICT, rr.TextDocument(localized.metrics.judged.sentence)),
-        Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.BLUE])),
+        Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.Color.BLUE])),
         Message(entities.STATE, rr.StateConfiguration(values=names, labels=names, colors=colors)),
         *_localized(localized),
     ]
@@ -220,18 +216,18 @@ def _localized(localized: LocalizedLog) -> Iterator[Message]:
         yield Message(entities.LIDAR, drawing.transforms(found.live[placed]), times[placed])
     for keyframe in keyframes[len(localized.prior.keyframes) :]:
         if placed[keyframe.scan_index]:
-            points = drawing.at_most(keyframe.points, _MAX_SCAN_POINTS)
+            points = drawing.at_most(keyframe.points, 5_000)
             yield Message(entities.SCAN, drawing.dots(points), times[np.array([keyframe.scan_index])])
     for closure in found.closures:  # hypotheses while it searches, matches then
         T_map_target = keyframes[closure.target].T_odom_lidar
         ends = drawing.positions(np.stack([T_map_target, T_map_target @ closure.match.T_target_source]))
         is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
-        line = drawing.lines([ends], entities.GREEN if is_accepted else entities.RED, 2.0)
+        line = drawing.lines([ends], entities.Color.GREEN if is_accepted else entities.Color.RED, 2.0)
         when = times[np.array([keyframes[closure.source].scan_index])]
         yield Message(_MATCHED if is_accepted else _UNMATCHED, line, when)
     if found.is_placed.any():
         path = drawing.positions(found.trajectory.poses[found.is_placed])
-        yield Message(_FINAL, drawing.lines([path], entities.CYAN, 1.0))
+        yield Message(_FINAL, drawing.lines([path], entities.Color.CYAN, 1.0))
 
 
 def record_graph(change: GraphChange, path: Path) -> None:
@@ -245,9 +241,9 @@ def record_graph(change: GraphChange, path: Path) -> None:
 def _graph(state: GraphState, when: int) -> Iterator[Message]:
     """Nodes, chain, loops and rejected edges at one instant."""
     times, nodes = Times.at(when, when), drawing.positions(state.poses)
-    yield Message(entities.KEYFRAMES, drawing.dots(nodes, entities.VIOLET, 1.5), times)
+    yield Message(entities.KEYFRAMES, drawing.dots(nodes, entities.Color.VIOLET, 1.5), times)
     names = (entities.ODOMETRY_EDGES, entities.ACCEPTED, entities.REJECTED)
-    colors = (entities.GRAY, entities.GREEN, entities.RED)
+    colors = (entities.Color.GRAY, entities.Color.GREEN, entities.Color.RED)
     for entity, edges, color in zip(names, state.drawn_edges, colors, strict=True):
         yield Message(entity, drawing.lines(nodes[edges], color, 0.75), times)
 
@@ -267,18 +263,18 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
 def _study(root: str, study: Study) -> Iterator[Message]:
     """The true trajectory and landmarks, static, and the estimates at their instants."""
     known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
-    path = drawing.lines([drawing.in_space(study.true_poses)], entities.GRAY, 1.0)
+    path = drawing.lines([drawing.in_space(study.true_poses)], entities.Color.GRAY, 1.0)
     yield Message(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     yield Message(f"{root}/truth/trajectory", path)
-    yield Message(f"{root}/truth/landmarks", drawing.dots(drawing.in_space(known), entities.GRAY, 4.0))
-    yield from _estimate(root, study.before, Times.at(0, 0), entities.ORANGE)
-    yield from _estimate(root, study.after, Times.at(1, 1), entities.BLUE)
+    yield Message(f"{root}/truth/landmarks", drawing.dots(drawing.in_space(known), entities.Color.GRAY, 4.0))
+    yield from _estimate(root, study.before, Times.at(0, 0), entities.Color.ORANGE)
+    yield from _estimate(root, study.after, Times.at(1, 1), entities.Color.BLUE)
     axes_m, angles_rad = problems.ellipses(study)
     drawn = rr.Ellipsoids3D.from_fields(
         centers=drawing.in_space(study.after.in_truth()[1]),
         half_sizes=np.pad(axes_m, ((0, 0), (0, 1)), constant_values=_FLAT_M),
         quaternions=_upright(angles_rad),
-        colors=entities.BLUE,
+        colors=entities.Color.BLUE,
     )
     yield Message(f"{root}/ellipses", drawn, Times.at(1, 1))
 

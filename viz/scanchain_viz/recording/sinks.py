@@ -33,8 +33,6 @@ from scanchain.processes import LOOK_S, KilledFor, die_first, die_with_parent, r
 from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.entities import UP
 
-_QUEUED_BATCHES = 16  # largest number of batches in memory that wait to be written
-_COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is copied
 _FILE_PATIENCE_S, _VIEWER_PATIENCE_S = 10.0, 5.0  # time without progress after which writing is abandoned
 _open: set[rr.RecordingStream] = set()  # those that are open or were not closed cleanly
 
@@ -61,7 +59,7 @@ class Sink:
         self.dropped = 0
         self.flushes = 0
         self.lock = threading.Lock()
-        self.waiting: queue.Queue[Callable[[rr.RecordingStream], object] | None] = queue.Queue(_QUEUED_BATCHES)
+        self.waiting: queue.Queue[Callable[[rr.RecordingStream], object] | None] = queue.Queue(16)
         self.thread = threading.Thread(target=self._serve, name=f"recording to {self.name}", daemon=True)
         self.thread.start()
 
@@ -119,7 +117,7 @@ class Sink:
             chunks = RrdReader(path).stream().filter(is_static=False)
         for number, chunk in enumerate(chunks, start=1):
             rr.send_chunks(chunk, recording=stream)
-            if number % _COPIED_CHUNKS == 0:
+            if number % 64 == 0:  # chunks in memory
                 self._flush()
 
     def _flush(self) -> None:

@@ -18,9 +18,7 @@ from scanchain.errors import InputError, ScanchainError
 
 HOST = "127.0.0.1"
 PORT, WEB_PORT = 9876, 9090  # as of rerun itself: of its viewer and of its web server
-_PROBE_S = 0.3  # longest time until a port of this machine answers
 _START_S = 8.0  # longest time until a viewer that was started listens
-_SETTLE_S = 0.5  # time that it must go on listening: one that cannot open a window ends before
 
 
 def grpc_address() -> str:
@@ -36,7 +34,7 @@ def web_address() -> str:
 def is_listening(port: int) -> bool:
     """True if a port of this machine accepts connections."""
     try:
-        with socket.create_connection((HOST, port), timeout=_PROBE_S):
+        with socket.create_connection((HOST, port), timeout=0.3):
             return True
     except OSError:
         return False
@@ -103,7 +101,8 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
             )
         if listening_since is None and all(is_listening(port) for port in ports):
             listening_since = monotonic()
-        if listening_since is not None and monotonic() - listening_since > _SETTLE_S:
+        # one that cannot open a window ends before
+        if listening_since is not None and monotonic() - listening_since > 0.5:
             return
         sleep(0.02)
     raise ScanchainError(f"no viewer: it did not respond within {_START_S:.0f} s; try `rerun` on its own")

@@ -42,7 +42,6 @@ STATE_COLORS = {
     MapState.LOST: "#d6453d",
 }
 _AFTERWARDS = "#0f9bb5"
-_CLOSE_UPS = 12  # largest number of close-ups: the largest clusters
 _AROUND_SIZE, _AROUND_M = 1.5, 1.0  # half the size of a close-up: times that of its cluster, plus meters
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
 _HEX = {label: f"#{bytes(COLORS[label]).hex()}" for label in Label}
@@ -192,7 +191,7 @@ def _changed(changes: Changes) -> Iterator[page.Section]:
     if changes.clusters:
         yield page.Section("What changed", grid=_cluster_grid(changes))
         drawings = []
-        for each in changes.clusters[:_CLOSE_UPS]:
+        for each in changes.clusters[:12]:  # the largest
             center = np.append(each.center[:2], 0.0)
             half_m = _AROUND_SIZE * float(each.size_m[:2].max()) + _AROUND_M
             figure = _changes_picture(points, changes, center - half_m, center + half_m)

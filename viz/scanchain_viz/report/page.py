@@ -30,8 +30,6 @@ MAX_ROWS = 100  # largest number of rows of a table; the longest segments or lar
 _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000  # largest number of points of a line: 0.03 MB of a page
 _HIGHEST = float(np.iinfo(np.uint16).max)  # coordinates have 16 bits
-_WIDEST = 3.0  # greatest width over height of a flat map's canvas
-_WIDER = 1.8  # factor on the width of lines on the canvas
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +214,7 @@ def interactive_map(
         '<canvas class="scene"{} tabindex="0" role="img" aria-label="Map and trajectory, to rotate and zoom" '
         'data-scene="{}"></canvas><div class="buttons"></div>'
     )
-    style = Markup(' style="height: auto; aspect-ratio: {:.3f}"').format(min(width / height, _WIDEST))
+    style = Markup(' style="height: auto; aspect-ratio: {:.3f}"').format(min(width / height, 3.0))
     drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     text = f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move."
     svg = canvas.format(style if is_flat else "", json.dumps(scene, separators=(",", ":")))
@@ -243,7 +241,7 @@ def _line(line: Line, low: Floats, high: Floats) -> dict[str, object]:
     return {
         "points": _packed(positions, low, high),
         "color": line.color,
-        "width": _WIDER * line.width,
+        "width": 1.8 * line.width,
         "dashed": line.is_dashed,
         "pairs": is_broken,
     }

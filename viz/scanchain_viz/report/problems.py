@@ -21,9 +21,7 @@ from scanchain_viz.report import page
 _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
 BEFORE, AFTER = "#e07b00", "#1f5fd0"
-_PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = math.sqrt(-2.0 * math.log(0.05))  # standard deviations that hold 95 % of a Gaussian in the plane
-_ELLIPSE_POINTS = 37  # vertices of an ellipse, every 10°
 _BLUES = ("f7fbff", "deebf7", "c6dbef", "9dcae1", "6aaed6", "4191c6", "2070b4", "08509b", "08306b")
 _TIMES = (
     "Times are medians; each method solves from scratch, including its analysis of the sparsity pattern (again: "
@@ -69,7 +67,7 @@ def _estimates(study: Study) -> tuple[Plot, Plot]:
     """Trajectory and landmarks before and after optimization, those after it with their 95 % ellipses."""
     before, after = _plot(study, study.before, BEFORE, "before"), _plot(study, study.after, AFTER, "after")
     axes_m, angles_rad = ellipses(study)
-    around = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
+    around = np.linspace(0.0, 2.0 * np.pi, 37)  # every 10°
     along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = np.cos(angles_rad), np.sin(angles_rad)
     outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + study.after.in_truth()[1][:, None]
@@ -102,7 +100,7 @@ def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _factor(method: MethodResult) -> Plot:
     """Nonzero entries of a method's factor, dark; a pixel of several entries is darker the denser they are."""
     matrix, size = method.factor.matrix.tocoo(), len(method.factor.order)
-    there, pixels = matrix.data != 0.0, min(size, _PIXELS)
+    there, pixels = matrix.data != 0.0, min(size, 500)
     count, _, _ = np.histogram2d(
         matrix.row[there], matrix.col[there], bins=pixels, range=[[-0.5, size - 0.5], [-0.5, size - 0.5]]
     )

@@ -22,7 +22,6 @@ from scanchain_viz.report import page
 from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Named, Row, Section
 
 MAX_POINTS = 1500  # largest number of points of a line, and of lines of one kind, in a figure
-_WINDOWS = 250  # number of windows over which a value of each scan is averaged
 CLIPPED = (0.01, 1000.0)  # range of observability and innovations that is drawn
 
 
@@ -175,7 +174,7 @@ def _some(count: int) -> NDArray[np.int64]:
 
 def window(count: int) -> int:
     """Number of neighboring values, out of ``count`` in total, that are combined to a point of a line."""
-    return max(1, -(-count // _WINDOWS))
+    return max(1, -(-count // 250))  # windows at most
 
 
 def windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = None) -> Floats:

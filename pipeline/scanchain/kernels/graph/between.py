@@ -7,7 +7,6 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import second_coefficient, twist_3d
 
 _Array = NDArray[np.float64]
-_SMALL = 1e-4  # rad; below this angle the series replaces the closed form
 
 
 @njit(nogil=True)
@@ -63,7 +62,7 @@ def _mismatch_2d(T_i: _Array, T_j: _Array, Z: _Array) -> tuple[float, float, flo
 @njit(inline="always")
 def _half_cotangent(theta_rad: float) -> float:
     """(θ/2) / tan(θ/2), the diagonal of V(θ)⁻¹."""
-    if abs(theta_rad) < _SMALL:
+    if abs(theta_rad) < 1e-4:  # the series replaces the closed form
         return 1.0 - theta_rad * theta_rad / 12.0
     half = 0.5 * theta_rad
     return half * np.cos(half) / np.sin(half)

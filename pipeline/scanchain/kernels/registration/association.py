@@ -3,20 +3,7 @@
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.voxels import (
-    ACROSS,
-    DIRECTION,
-    LINE,
-    MEAN_TERM,
-    PLANE,
-    SHAPE,
-    SLOPE_ACROSS,
-    SLOPE_ALONG,
-    THICKNESS,
-    find_row,
-    move,
-    pack,
-)
+from scanchain.kernels.voxels import LINE, PLANE, Cell, find_row, move, pack
 
 _GRAZING_SINE = 0.05  # of the angle between ray and plane at which the weight is halved
 _RING_WIDTHS = 2.0  # path of a ray within the thickness of a plane, in widths of it, at which the weight is halved
@@ -93,17 +80,17 @@ def weigh(voxels, points, T, correspondence, variance: float, weight):
             continue
         cell = voxels.cells[correspondence[i]]
         if planar:
-            weight[i] = 1.0 if cell[SHAPE] == PLANE else without_shape
+            weight[i] = 1.0 if cell[Cell.SHAPE] == PLANE else without_shape
             continue
         x, y, z = move(T, points, i)
         ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
         x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
-        if cell[SHAPE] == PLANE:
+        if cell[Cell.SHAPE] == PLANE:
             surface = _surface_weight(cell, x, y, z, variance) / (1.0 + _plane_variance(cell, ex, ey, ez))
-            weight[i] = surface * variance / max(cell[THICKNESS], variance)
-        elif cell[SHAPE] == LINE:
+            weight[i] = surface * variance / max(cell[Cell.THICKNESS], variance)
+        elif cell[Cell.SHAPE] == LINE:
             weight[i] = max(
-                _upright_weight(cell, T, x, y, z) * variance / max(cell[THICKNESS], variance), without_shape
+                _upright_weight(cell, T, x, y, z) * variance / max(cell[Cell.THICKNESS], variance), without_shape
             )
         else:
             weight[i] = without_shape
@@ -112,19 +99,19 @@ def weigh(voxels, points, T, correspondence, variance: float, weight):
 @njit(inline="always")
 def _plane_variance(cell, ex, ey, ez) -> float:
     """Variance of the fitted plane at (ex, ey, ez) from the mean, over that of a point on it."""
-    out = cell[DIRECTION] * ex + cell[DIRECTION + 1] * ey + cell[DIRECTION + 2] * ez
-    across = cell[ACROSS] * ex + cell[ACROSS + 1] * ey + cell[ACROSS + 2] * ez
+    out = cell[Cell.DIRECTION] * ex + cell[Cell.DIRECTION + 1] * ey + cell[Cell.DIRECTION + 2] * ez
+    across = cell[Cell.ACROSS] * ex + cell[Cell.ACROSS + 1] * ey + cell[Cell.ACROSS + 2] * ez
     along2 = max(ex * ex + ey * ey + ez * ez - out * out - across * across, 0.0)
-    return cell[MEAN_TERM] + cell[SLOPE_ACROSS] * across * across + cell[SLOPE_ALONG] * along2
+    return cell[Cell.MEAN_TERM] + cell[Cell.SLOPE_ACROSS] * across * across + cell[Cell.SLOPE_ALONG] * along2
 
 
 @njit(inline="always")
 def _surface_weight(cell, x, y, z, variance: float) -> float:
     """Weight of a plane hit by the ray (x, y, z), low where its points may be those of one ring, 0 to 1."""
-    out = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
+    out = cell[Cell.DIRECTION] * x + cell[Cell.DIRECTION + 1] * y + cell[Cell.DIRECTION + 2] * z
     sine2 = out * out / max(x * x + y * y + z * z, 1e-300)
-    width2 = cell[MEAN_TERM] / cell[SLOPE_ACROSS]
-    edge = _GRAZING_SINE * _GRAZING_SINE + _RING_WIDTHS * _RING_WIDTHS * cell[THICKNESS] / width2
+    width2 = cell[Cell.MEAN_TERM] / cell[Cell.SLOPE_ACROSS]
+    edge = _GRAZING_SINE * _GRAZING_SINE + _RING_WIDTHS * _RING_WIDTHS * cell[Cell.THICKNESS] / width2
     return sine2 / (sine2 + edge) * width2 / (width2 + _NOISE_WIDTHS * _NOISE_WIDTHS * variance)
 
 
@@ -134,6 +121,6 @@ def _upright_weight(cell, T, x, y, z) -> float:
     zx, zy, zz = T[0, 2], T[1, 2], T[2, 2]
     height = (x * zx + y * zy + z * zz) / max(x * x + y * y + z * z, 1e-300)
     ux, uy, uz = zx - height * x, zy - height * y, zz - height * z
-    cosine = cell[DIRECTION] * ux + cell[DIRECTION + 1] * uy + cell[DIRECTION + 2] * uz
+    cosine = cell[Cell.DIRECTION] * ux + cell[Cell.DIRECTION + 1] * uy + cell[Cell.DIRECTION + 2] * uz
     cosine2 = cosine * cosine / max(ux * ux + uy * uy + uz * uz, 1e-300)
     return cosine2 / (cosine2 + _UPRIGHT_COSINE * _UPRIGHT_COSINE)

@@ -1,5 +1,6 @@
 """Point-to-shape ICP against a voxel map: associate, linearize, step, until the pose is at a minimum."""
 
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -9,28 +10,38 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import orthonormalize, perturb
 from scanchain.kernels.matrices import factorize, substitute
 from scanchain.kernels.registration.association import associate, weigh
-from scanchain.kernels.registration.residuals import (
-    Problem,
-    gradients_by_group,
-    normal_equations,
-    robust_sums,
-)
-from scanchain.kernels.voxels import LINE, PLANE, POINT, SHAPE, move, shape_of
-
-CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
+from scanchain.kernels.registration.residuals import Problem, gradients_by_group, normal_equations, robust_sums
+from scanchain.kernels.voxels import LINE, PLANE, POINT, Cell, move, shape_of
 
 SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
 SLACK = 0.02  # voxels that points may move before they are re-associated
 PATIENCE = 20  # steps at the final scale, after which correspondences are fixed
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
+_DAMPING = (1e-9, 1e8)  # least and most
 _SECTORS = 8  # of a scan
-_COST, _WEIGHT, _SQUARES, _DAMPING = 0, 1, 2, 3  # entries of ``Iterate.sums``
+
+
+class Ending(IntEnum):
+    """Why the iterations ended."""
+
+    CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
+
+
+class Sums(IntEnum):
+    """Entries of ``Iterate.sums``: cost in m², Σ w, Σ w r² in m², damping."""
+
+    COST, WEIGHT, SQUARES, DAMPING = 0, 1, 2, 3
+
+
+class Optimizer(IntEnum):
+    """Rules for a step."""
+
+    GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
 
 
 class Iterate(NamedTuple):
     """A pose, its twist ``offset`` (k,) from the predicted one, and its normal equations.
 
-    sums : (4,) cost in m², Σ w, Σ w r² in m², damping
+    sums : (4,) as in ``Sums``
     """
 
     T: NDArray[np.float64]
@@ -47,7 +58,7 @@ class Fit(NamedTuple):
         without a shape would constrain a pose in every direction, whether the surface does or not
     cost : robust cost in m², with the limit ½s² for every point without a correspondence
     total_weight, squares : Σ w and Σ w r² (m²)
-    pairs, iterations, ending : correspondences, linearizations, one of the codes above
+    pairs, iterations, ending : correspondences, linearizations, an ``Ending``
     """
 
     H: NDArray[np.float64]
@@ -85,17 +96,17 @@ def align(problem, T, offset, first_scale_m: float):
     now = Iterate(T, offset.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     trial = Iterate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     x, factor = np.zeros(k), np.zeros((k, k))
-    now.sums[_DAMPING] = _FIRST_DAMPING
+    now.sums[Sums.DAMPING] = 1e-4
     scale_m, last_scale_m, steps_at_last = first_scale_m, 0.0, 0
     moved_m = np.inf
-    pairs, iterations, ending = 0, 0, OUT_OF_ITERATIONS
+    pairs, iterations, ending = 0, 0, Ending.OUT_OF_ITERATIONS.value
     while iterations < settings.max_iterations:
         iterations += 1
         if steps_at_last < PATIENCE and moved_m > SLACK * size_m:
             moved_m = 0.0
             pairs = correspond(problem, T, settings.reach, settings.max_distance_m)
             if pairs == 0:
-                ending = NO_CORRESPONDENCES
+                ending = Ending.NO_CORRESPONDENCES.value
                 break
         if moved_m == 0.0 or scale_m != last_scale_m:
             _linearize(problem, scale_m, now)
@@ -103,20 +114,20 @@ def align(problem, T, offset, first_scale_m: float):
         if scale_m <= settings.scale_m:
             slack_m = SLACK * size_m - moved_m if steps_at_last + 1 < PATIENCE else np.inf
         if not _descend(problem, scale_m, slack_m, now, trial, x, factor):
-            ending = SINGULAR
+            ending = Ending.SINGULAR.value
             break
         if scale_m <= settings.scale_m:
             if _is_small(x, settings):
-                ending = CONVERGED
+                ending = Ending.CONVERGED.value
                 break
             steps_at_last += 1
         moved_m += _largest_move(x, problem.range_m)
         last_scale_m, scale_m = scale_m, max(settings.scale_m, SHRINK * scale_m)
     orthonormalize(T)
-    cost = now.sums[_COST] - _prior_cost(problem.prior, now.offset)
+    cost = now.sums[Sums.COST] - _prior_cost(problem.prior, now.offset)
     cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
     H = shape_information(problem, T)
-    return Fit(H, cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
+    return Fit(H, cost, now.sums[Sums.WEIGHT], now.sums[Sums.SQUARES], pairs, iterations, ending)
 
 
 @njit(nogil=True)
@@ -198,7 +209,7 @@ def shape_information(problem, T):
     k = problem.prior.shape[0]
     for i in range(problem.points.shape[0]):
         voxel = problem.correspondence[i]
-        if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
+        if voxel >= 0 and problem.voxels.cells[voxel, Cell.SHAPE] == POINT:
             problem.weight[i] = 0.0
     H, b = np.empty((k, k)), np.empty(k)
     normal_equations(problem, T, problem.settings.scale_m, 0.0, H, b)
@@ -220,7 +231,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         T = poses[k].copy()
         problem = problem_of(voxels, scan, T, prior, settings)
         fit = align(problem, T, offset, settings.first_scale_m)
-        if fit.ending == CONVERGED and fit.pairs >= least_share * scan.shape[0]:
+        if fit.ending == Ending.CONVERGED and fit.pairs >= least_share * scan.shape[0]:
             _copy(T, poses[k])
 
 
@@ -235,7 +246,7 @@ def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> 
     """
     settings = problem.settings
     growth = 2.0
-    while step(settings.optimizer, now.H, now.b, now.sums[_DAMPING], factor, x):
+    while step(settings.optimizer, now.H, now.b, now.sums[Sums.DAMPING], factor, x):
         perturb(x, now.T, problem.origin, trial.T)
         for i in range(x.shape[0]):
             trial.offset[i] = now.offset[i] + x[i]
@@ -243,17 +254,17 @@ def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> 
             _evaluate(problem, scale_m, trial)
         else:
             _linearize(problem, scale_m, trial)
-        lowered = now.sums[_COST] - trial.sums[_COST]
-        if settings.optimizer != LEVENBERG_MARQUARDT or lowered >= 0.0:
+        lowered = now.sums[Sums.COST] - trial.sums[Sums.COST]
+        if settings.optimizer != Optimizer.LEVENBERG_MARQUARDT or lowered >= 0.0:
             gain = min(lowered / max(predicted_decrease(now.H, now.b, x), 1e-300), 1.0)
-            relaxed = now.sums[_DAMPING] * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-            trial.sums[_DAMPING] = max(relaxed, _LEAST_DAMPING)
+            relaxed = now.sums[Sums.DAMPING] * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            trial.sums[Sums.DAMPING] = max(relaxed, _DAMPING[0])
             _accept(now, trial)
             return True
-        if _is_small(x, settings) or now.sums[_DAMPING] > _MOST_DAMPING:
+        if _is_small(x, settings) or now.sums[Sums.DAMPING] > _DAMPING[1]:
             x.fill(0.0)
             return True
-        now.sums[_DAMPING] *= growth
+        now.sums[Sums.DAMPING] *= growth
         growth *= 2.0
     return False
 
@@ -261,7 +272,7 @@ def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> 
 @njit(nogil=True)
 def _linearize(problem, scale_m: float, iterate):
     """Fill the iterate's normal equations and sums at its pose, the prior included."""
-    curvature = 1.0 if problem.settings.optimizer == NEWTON else 0.0
+    curvature = 1.0 if problem.settings.optimizer == Optimizer.NEWTON else 0.0
     cost, total_weight, squares = normal_equations(problem, iterate.T, scale_m, curvature, iterate.H, iterate.b)
     for i in range(iterate.b.shape[0]):
         gradient = 0.0
@@ -270,7 +281,7 @@ def _linearize(problem, scale_m: float, iterate):
             iterate.H[i, j] += problem.prior[i, j]
         iterate.b[i] += gradient
         cost += 0.5 * gradient * iterate.offset[i]
-    iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
+    iterate.sums[Sums.COST], iterate.sums[Sums.WEIGHT], iterate.sums[Sums.SQUARES] = cost, total_weight, squares
 
 
 @njit(inline="always")
@@ -278,7 +289,7 @@ def _evaluate(problem, scale_m: float, iterate):
     """Fill the iterate's sums at its pose, without updating its normal equations."""
     cost, total_weight, squares = robust_sums(problem, iterate.T, scale_m)
     cost += _prior_cost(problem.prior, iterate.offset)
-    iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
+    iterate.sums[Sums.COST], iterate.sums[Sums.WEIGHT], iterate.sums[Sums.SQUARES] = cost, total_weight, squares
 
 
 @njit(inline="always")
@@ -335,9 +346,6 @@ def _squares(x):
     return shift, turn
 
 
-GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
-
-
 @njit(nogil=True)
 def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
     """True if the normal equations could be solved; the step ξ of one iteration is written to ``x`` (k,).
@@ -349,7 +357,7 @@ def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
     factor : (k, k), buffer for the factorization
     """
     k = b.shape[0]
-    if optimizer == GRADIENT_DESCENT:
+    if optimizer == Optimizer.GRADIENT_DESCENT:
         along = square = 0.0
         for i in range(k):
             square += b[i] * b[i]
@@ -358,10 +366,10 @@ def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
         for i in range(k):
             x[i] = -b[i] * square / along if along > 0.0 else 0.0
         return along > 0.0
-    if optimizer != LEVENBERG_MARQUARDT:
+    if optimizer != Optimizer.LEVENBERG_MARQUARDT:
         damping = 0.0
     while not factorize(H, damping, factor):
-        if optimizer != NEWTON or damping >= 1e6:
+        if optimizer != Optimizer.NEWTON or damping >= 1e6:
             return False
         damping = max(4.0 * damping, 1e-3)
     substitute(factor, b, x)

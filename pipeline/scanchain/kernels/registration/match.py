@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import adjoint, between, centered, inverse, perturb, twist_2d, twist_3d
 from scanchain.kernels.matrices import congruent, definite_inverse, factorize, substitute
-from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, gradients_of_sectors, problem_of
+from scanchain.kernels.registration.icp import Ending, align, fit_at, gradients_of_sectors, problem_of
 from scanchain.kernels.registration.observability import (
     WEAK,
     add_signals,
@@ -162,7 +162,7 @@ def _result(problem, T, T_first, fit, H, last, spectrum, spread):
         last.pairs,
         on_surfaces,
         fit.iterations,
-        fit.ending if last.pairs else NO_CORRESPONDENCES,
+        fit.ending if last.pairs else Ending.NO_CORRESPONDENCES.value,
         1.0 if len(spread) else _variance_factor(problem, fit),
         _systematic(problem, T, T_first, fit, gradients_of_sectors(problem, T)),
     )

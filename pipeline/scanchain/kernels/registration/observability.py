@@ -8,18 +8,7 @@ from numpy.typing import NDArray
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import adjoint, centered
 from scanchain.kernels.matrices import congruent, eigensystem
-from scanchain.kernels.voxels import (
-    ACROSS,
-    BORN,
-    MEAN_TERM,
-    PLANE,
-    SLOPE_ACROSS,
-    SLOPE_ALONG,
-    THICKNESS,
-    move,
-    shape_of,
-    unpack,
-)
+from scanchain.kernels.voxels import PLANE, Cell, History, move, shape_of, unpack
 
 WEAK = 10.0  # times the limits of a degenerate direction, below which the prior is used along a direction
 _FIXED = 1e3  # information of the prior along a degenerate direction, times that of all residuals
@@ -205,7 +194,7 @@ def signal_along(problem, T, twist) -> float:
         beside = dx * dx + dy * dy + dz * dz - along * along
         if shape == PLANE:
             noise += weight * _normal_variance(voxels.cells, voxel, dx, dy, dz, beside, parameters)
-        if voxels.history[voxel, BORN] <= youngest:
+        if voxels.history[voxel, History.BORN] <= youngest:
             informative[i] = weight * (along * along if shape == PLANE else beside)
             total += informative[i]
             if informative[i] > most:
@@ -221,10 +210,12 @@ def _normal_variance(cells, voxel: int, dx, dy, dz, beside: float, parameters: f
 
     τ² is estimated from m points less the parameters of the fit.
     """
-    across = cells[voxel, ACROSS] * dx + cells[voxel, ACROSS + 1] * dy + cells[voxel, ACROSS + 2] * dz
-    m = 1.0 / cells[voxel, MEAN_TERM]
-    variance = cells[voxel, THICKNESS] * m / max(m - parameters, 1.0)
-    slope_across, slope_along = cells[voxel, SLOPE_ACROSS], cells[voxel, SLOPE_ALONG]
+    across = (
+        cells[voxel, Cell.ACROSS] * dx + cells[voxel, Cell.ACROSS + 1] * dy + cells[voxel, Cell.ACROSS + 2] * dz
+    )
+    m = 1.0 / cells[voxel, Cell.MEAN_TERM]
+    variance = cells[voxel, Cell.THICKNESS] * m / max(m - parameters, 1.0)
+    slope_across, slope_along = cells[voxel, Cell.SLOPE_ACROSS], cells[voxel, Cell.SLOPE_ALONG]
     return variance * (slope_across * across * across + slope_along * (beside - across * across))
 
 

@@ -10,8 +10,7 @@ from scanchain.kernels.voxels import add_moments, covariance_of, find_row, key_o
 
 _FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in the cell of a plane, and of scans that see it
 _THIN, _FLAT, _WIDE = 0.02, 0.15, 0.1  # of a plane: ratio of its variances, largest and least deviation in cells
-
-_LEAST_SLOPE = 0.4  # least ratio of Σψ' to Σw, which limits the extension of steps
+LEAST_SLOPE = 0.4  # least ratio of Σψ' to Σw, which limits the extension of steps
 
 
 @njit(nogil=True)
@@ -117,7 +116,7 @@ def plane_equations(points, number, plane, beside, residual, normals, poses, sca
             _eliminate(S[p], sums[p], H)
     for row in range(size):
         H[row + 1 :, row] = H[row, row + 1 :]
-    slopes = max(slopes, _LEAST_SLOPE * total)
+    slopes = max(slopes, LEAST_SLOPE * total)
     return squares * total / slopes**2, total / slopes
 
 

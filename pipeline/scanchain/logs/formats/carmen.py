@@ -41,7 +41,6 @@ KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
 SCANS = (b"FLASER", b"ROBOTLASER1")
 _LEAST_CODE_M = 81.83  # smallest range in meters that a SICK LMS uses as an error code, such as for no return
 _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
-_AT_ONCE = 256  # bytes of text decompressed at once; all of them are lost if they are damaged
 _LONGEST_LINE = 1 << 18  # largest length of a line in bytes; a longer one is malformed
 
 
@@ -166,7 +165,7 @@ def read_lines(path: Path, damage: list[str]) -> Iterator[bytes]:
             head, most = file.read(3), most_decompressed_file(path.stat().st_size)
         opened = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else Path.open
         with opened(path, "rb") as file:
-            while block := file.read1(_AT_ONCE):
+            while block := file.read1(256):  # bytes; all are lost if they are damaged
                 size += len(block)
                 if size > most:
                     raise InputError(f"{path}: decompresses to more than {most:,} bytes; is it a CARMEN log?")

@@ -29,13 +29,11 @@ from scanchain.logs.writer import LATEST_NS, pack_cloud
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # unit of a stamp by its number of digits, for stamps after 2001
 
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
-_MOST_COLUMNS = 16  # of an array of points, as of log.bin_columns; more indicate another kind of array
 XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 
 _PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8"} | {
     (sign, str(size)): f"<{code}{size}" for sign, code in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
 }
-_MOST_LZF_RATIO = 1000  # largest accepted compression ratio; LZF reaches about 130
 
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -43,7 +41,6 @@ _PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_MOST_HEADER_LINES = 1000  # of a PCD or PLY file; more indicate another kind of file
 
 _ONE_AT_A_TIME = Lock()  # for .npy headers: NumPy parses them with ast, which is not thread-safe in Python 3.11
 
@@ -112,7 +109,7 @@ def read_npy(path: Path) -> NDArray[np.void]:
         raise CloudFileError("is an archive of arrays, not a .npy array; save each cloud in a separate file")
     if array.dtype.names and array.ndim == 1:
         return array
-    is_list = array.ndim == 2 and 3 <= array.shape[1] <= _MOST_COLUMNS
+    is_list = array.ndim == 2 and 3 <= array.shape[1] <= 16  # more indicate another kind of array
     if array.dtype.kind not in "fiu" or not is_list or (len(array) in (3, 4) and array.shape[1] > 4):
         raise CloudFileError(
             f"is an array {array.shape} of {array.dtype}; give numbers (N, 3), (N, 4) or more columns, x y z first"
@@ -156,7 +153,7 @@ def read_pcd(path: Path) -> NDArray[np.void]:
 
 def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
     """Words of each line up to the one that begins with ``last``, at most a thousand lines."""
-    for _ in range(_MOST_HEADER_LINES):
+    for _ in range(1000):  # more indicate another kind of file
         words = file.readline(65536).decode("ascii", "replace").split()
         yield words
         if words[:1] == [last]:
@@ -167,7 +164,7 @@ def _lzf_decompressed(file: IO[bytes], point: np.dtype[np.void], count: int) -> 
     """Points compressed by LZF, stored field by field."""
     packed_size, size = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     packed = file.read(packed_size)
-    if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
+    if size < count * point.itemsize or size > 1000 * len(packed):  # LZF reaches about 130
         raise CloudFileError(
             f"cannot be decompressed: {size} bytes are stated for {count} points, {len(packed)} are present"
         )

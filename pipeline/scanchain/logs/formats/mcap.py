@@ -50,14 +50,11 @@ RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # record, start, end, uncompressed size, CRC-32, length of a name
 MALFORMED = (McapError, struct.error, UnicodeDecodeError)  # raised for bytes that are no record
-_MOST_TRAILING = 256  # bytes allowed after a definition; more indicate another record with a damaged opcode
 
 # smallest number of bytes of a record's body, by the specification
 _LEAST_BYTES = {Opcode.HEADER: 8, Opcode.MESSAGE: MESSAGE_HEAD.size, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8}
 _DATA_END = RECORD.pack(Opcode.DATA_END, 4)
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
-_TAIL_BYTES = 65_536  # bytes read from the end of a file first; most summaries fit, so one request suffices
-_LONGEST_NAME = 16  # bytes of the name of a compression; known ones have 3 or 4
 
 
 def index_file(path: Path, number: int) -> FileIndex:
@@ -100,7 +97,8 @@ def empty_index(
 
 def _add_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     """Add the records of a file's summary; False if it does not state the position of every message."""
-    tail = bytes(index.bytes_at(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES)))
+    # most summaries fit, so one request suffices
+    tail = bytes(index.bytes_at(max(size - 65_536, 0), min(size, 65_536)))
     footer = tail[-_FOOTER_BYTES:]
     if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != Opcode.FOOTER:
         return False
@@ -308,7 +306,8 @@ def _record_end(index: FileIndex, offset: int) -> int:
 
 def _chunk_at(index: FileIndex, offset: int) -> Block | None:
     """Block of the chunk that begins here, whatever its opcode; None unless its two stated lengths agree."""
-    head = index.data[offset : offset + CHUNK_HEAD.size + _LONGEST_NAME + 8]
+    # the name of a compression has 3 or 4 bytes, here at most 16
+    head = index.data[offset : offset + CHUNK_HEAD.size + 16 + 8]
     if len(head) < CHUNK_HEAD.size + 8:
         return None
     _, length, *times_ns, uncompressed, _, name = CHUNK_HEAD.unpack_from(head)
@@ -383,7 +382,7 @@ def definition(opcode: int, body: bytes) -> Schema | ChannelRecord:
     """Schema or channel defined by a record. Raises one of MALFORMED."""
     stream = ReadDataStream(BytesIO(body))
     record = (Schema if opcode == Opcode.SCHEMA else ChannelRecord).read(stream)
-    if stream.count + _MOST_TRAILING < len(body):
+    if stream.count + 256 < len(body):  # more indicate another record with a damaged opcode
         raise struct.error("definition of another length than its record")
     return record
 

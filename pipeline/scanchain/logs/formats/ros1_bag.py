@@ -53,7 +53,6 @@ _FIELDS: dict[int, bytes] = {  # a field that identifies each type of record; "c
 }  # fmt: skip
 _OUTSIDE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
 _INSIDE = re.compile(rb"\x04\0\0\0op=[\x02\x07]")  # of a chunk: opcode of a message, a connection
-_MOST_BEFORE = 256  # largest number of bytes of a head before its opcode, when a record is searched
 
 
 class Record(NamedTuple):
@@ -133,7 +132,8 @@ def next_record(data: Data, offset: int, stated_end: int, opcodes: re.Pattern[by
         because chunks contain connections too
     """
     for match in opcodes.finditer(data, offset + 1):
-        for begin in range(match.start() - _LENGTH.size, max(offset, match.start() - _MOST_BEFORE), -1):
+        # a head has at most 256 bytes before its opcode
+        for begin in range(match.start() - _LENGTH.size, max(offset, match.start() - 256), -1):
             record = read_record(data, begin)
             if record is None or record.begin < match.end() or record.end > len(data):
                 continue

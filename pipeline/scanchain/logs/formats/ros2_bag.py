@@ -40,8 +40,6 @@ _MOST_DECOMPRESSED = 1 << 27  # largest decompressed size of the messages of a b
 _MODE = re.compile(r"^( *compression_mode:)[ \"']*(\w*).*$", re.MULTILINE)
 _COUNT = re.compile(r"^  message_count: *(\d{1,15})$", re.MULTILINE)
 
-_ROW_BYTES = 16  # smallest size of a row, which limits the row ids of a damaged table
-_MOST_FAILURES = 5_000  # largest number of failed queries per table; they take about half a second
 _TABLES = (
     "SELECT name, sql FROM sqlite_master WHERE name IN ('schema', 'topics', 'message_definitions', 'messages')"
 )
@@ -234,7 +232,7 @@ def _copy_rows(counts: Counter[str], file: Path, copy: Path) -> None:
                         ends += [end for (end,) in old.execute(f"SELECT max(rowid) FROM {name} {index}") if end]
                 counts["stated"] += max(ends, default=0) if name == "messages" else 0
                 marks = ", ".join("?" for _ in old.execute(f"SELECT * FROM {name} LIMIT 0").description)
-                rows = _rows(old, name, max(ends, default=file.stat().st_size // _ROW_BYTES))
+                rows = _rows(old, name, max(ends, default=file.stat().st_size // 16))  # bytes of the smallest row
                 new.executemany(f"INSERT OR IGNORE INTO {name} VALUES ({marks})", rows)
         new.executescript(_CLEAN)
         ((left,),) = new.execute("SELECT count(*) FROM messages")
@@ -254,7 +252,7 @@ def _rows(base: sqlite3.Connection, table: str, last: int) -> Iterator[list[Any]
                 yield row
         except sqlite3.Error:
             failures += 1
-            if first < last and failures < _MOST_FAILURES:
+            if first < last and failures < 5_000:  # these take about half a second
                 middle = (first + last) // 2
                 ranges += (first, middle), (middle + 1, last)
 

@@ -36,15 +36,13 @@ _CORE = 0.7  # share of correct times assumed in a scan: the span of its densest
 _SAMPLE = np.sort(np.random.default_rng(0).random(512))  # positions, 0 to 1, of the times that are sampled
 
 # comparison with the neighboring scans and the period; chosen with the drivers of tests/logs/test_point_times.py
-_BEFORE, _AFTER = 12, 3  # number of neighbors before and after a scan
+_NEIGHBORS = (12, 3)  # number of them before and after a scan
 _SHORT, _LONG = 0.9, 1.2  # limits of a span as a share of the usual span or of the period
 _DENSE = 0.85  # smallest share of the core in the span of a sweep without outliers
 _LONGEST, _MOST_PERIODS = 2.5, 10.0  # longest sweep without outliers in usual spans, and any sweep in periods
 _STEP = 0.25  # share of the usual span above which a step back starts a row, or is a reset of the counter
 _PART_OF_TURN = 0.6  # smallest share of the time of a turn that its beams take
-_SPANS = 100  # number of first scans whose spans are compared with the period
-_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # limits of a span as a share of the period: outside, the unit is wrong
-_ROUNDING_RAD = 1e-6  # of an azimuth of a point in float32
+_PARTS = (0.005, 2.0)  # limits of a span as a share of the period: outside, the unit is wrong
 
 _LEFT_OUT = "contradict the others: these points are left out"
 _UNWRAPPED = "step back where a counter wrapped or was reset: repaired"
@@ -216,7 +214,7 @@ class PointTimes:
 
     def checked(self, messages: Iterable[Decoded], topic: str, *, most_ns: float = inf) -> Iterator[Decoded]:
         """Messages in their order, the scans of the topic with checked times, held back by ``most_ns`` at most."""
-        waiting, before, ahead = deque[Decoded](), deque[Returns](maxlen=_BEFORE), deque[Returns]()
+        waiting, before, ahead = deque[Decoded](), deque[Returns](maxlen=_NEIGHBORS[0]), deque[Returns]()
         for message in chain(messages, [None]):
             if message is not None:
                 waiting.append(message)
@@ -224,7 +222,7 @@ class PointTimes:
                     ahead.append(message.value)
             while waiting and (
                 message is None
-                or len(ahead) > _AFTER
+                or len(ahead) > _NEIGHBORS[1]
                 or not ahead
                 or waiting[0].value is not ahead[0]
                 or message.log_time_ns - waiting[0].log_time_ns > most_ns
@@ -250,8 +248,9 @@ class PointTimes:
 
     def warnings(self, topic: str) -> list[str]:
         """Warning if by the period the times of sweeps are in another unit."""
-        span_s, period_s = (median_low(each[:_SPANS] or [0.0]) for each in (self.spans_s, self.periods_s))
-        if not span_s or not period_s or _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
+        # of the first scans
+        span_s, period_s = (median_low(each[:100] or [0.0]) for each in (self.spans_s, self.periods_s))
+        if not span_s or not period_s or _PARTS[0] < span_s / period_s < _PARTS[1]:
             return []
         return [
             f"by their point times scans of {topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} of the "
@@ -333,7 +332,7 @@ def from_azimuth(points: RawPoints, config: LogConfig) -> NDArray[np.float32]:
     """Times (N,) of points (N, d) by the azimuth from that of the lidar at the stamp."""
     sense = -1.0 if config.point_times == "clockwise" else 1.0
     turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad) % (2.0 * np.pi)
-    turned[turned > 2.0 * np.pi - _ROUNDING_RAD] = 0.0  # else the first ray may be the last one
+    turned[turned > 2.0 * np.pi - 1e-6] = 0.0  # else the first ray may be the last one
     return (turned * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
 
 

@@ -31,8 +31,6 @@ class Room(NamedTuple):
 
 _CEILING_M, _WALL_M = 2.8, 0.12  # height of rooms and thickness of their walls, meters
 _DOOR_M = 1.0  # width of a doorway, and the distance from it that is kept free for its leaf
-_ROUTE_M = 0.5  # distance from the robot's route that is kept free
-_TRIES = 12  # number of positions sampled for a piece of furniture
 _SIZES_M = {  # length and width of its footprint
     "shelf": (1.2, 0.35),
     "desk": (1.6, 1.5),  # with its chair
@@ -96,7 +94,7 @@ def furnish(scenery: Scenery, rooms: Matrix, route: Matrix, doors: Matrix, rng: 
         desks = int(np.prod(room[2:] - room[:2]) / 5.0)
         kinds = [*["shelf"] * 3, *["desk"] * desks, *["bin"] * 2, "plant"]
         for kind in kinds:
-            for _ in range(_TRIES):
+            for _ in range(12):
                 upright = int(rng.integers(2))
                 half = 0.5 * np.array(_SIZES_M[kind])[[upright, 1 - upright]]
                 low, high = room[:2] + 0.1 + half, room[2:] - 0.1 - half
@@ -116,7 +114,7 @@ def _is_free(center: Matrix, half: Matrix, taken: list[Matrix], route: Matrix, d
     """True if an axis-aligned rectangle overlaps no other one and leaves the route and the doorways free."""
     if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in taken):
         return False
-    kept_free = ((route, _ROUTE_M), (doors, _DOOR_M))
+    kept_free = ((route, 0.5), (doors, _DOOR_M))
     outside = ((np.maximum(np.abs(places - center) - half, 0.0), limit_m) for places, limit_m in kept_free)
     return all(np.linalg.norm(each, axis=1).min() >= limit_m for each, limit_m in outside)
 

@@ -6,7 +6,6 @@ direction and lane.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
 from typing import NamedTuple
@@ -88,25 +87,20 @@ ROUNDS_ROUTE = np.array([
 ])  # fmt: skip
 
 
-def town(
-    rng: np.random.Generator,
-    parked: float = 0.55,
-    *,
-    streets_x_m: Sequence[float] = (-50.0, 0.0, 50.0, 100.0, 150.0),
-    streets_y_m: Sequence[float] = (-40.0, 0.0, 40.0, 80.0),
-) -> Solids:
+def town(rng: np.random.Generator, parked: float = 0.55) -> Solids:
     """The town; streets and blocks are fixed, everything else is sampled from ``rng``.
 
     parked : share of the parking spaces at the curb that are occupied
-    streets_x_m, streets_y_m : middles of the streets that run north, and east
     """
+    north_m = (-50.0, 0.0, 50.0, 100.0, 150.0)  # x of the streets that run north
+    east_m = (-40.0, 0.0, 40.0, 80.0)  # y of those that run east
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)  # of waves of 0.5 m: slopes of 3 % at most
     scenery = Scenery(np.array([0.0, 0.5, 2.0 * np.pi / 140.0, phase_x, 0.5, 2.0 * np.pi / 110.0, phase_y]))
-    for (west, east), (south, north) in product(pairwise(streets_x_m), pairwise(streets_y_m)):
+    for (west, east), (south, north) in product(pairwise(north_m), pairwise(east_m)):
         _block(scenery, west, east, south, north, rng)
-    for y, (west, east) in product(streets_y_m, pairwise(streets_x_m)):
+    for y, (west, east) in product(east_m, pairwise(north_m)):
         _street(scenery, np.array([west, y]), np.array([east, y]), parked, rng)
-    for x, (south, north) in product(streets_x_m, pairwise(streets_y_m)):
+    for x, (south, north) in product(north_m, pairwise(east_m)):
         _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
 
@@ -388,7 +382,7 @@ def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng:
 
 # the yard
 
-_YARD_X_M, _YARD_Y_M = 19.0, 15.0  # half the length and half the width between its walls
+_YARD_M = (19.0, 15.0)  # half the length and half the width between its walls
 
 YARD_ROBOT = Vehicle(
     speed_m_s=1.5, acceleration_m_s2=1.5, lateral_acceleration_m_s2=1.0, sway_rad=0.006, heave_m=0.004,
@@ -409,12 +403,12 @@ def yard(rng: np.random.Generator) -> Solids:
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
     scenery = Scenery(np.array([0.0, 0.1, 2.0 * np.pi / 30.0, phase_x, 0.1, 2.0 * np.pi / 24.0, phase_y]))
     for side in (-1.0, 1.0):
-        scenery.box((0.0, side * _YARD_Y_M), (2.0 * _YARD_X_M, 0.3), (BELOW_M, rng.uniform(1.8, 3.0)))
-        scenery.box((side * _YARD_X_M, 0.0), (0.3, 2.0 * _YARD_Y_M), (BELOW_M, rng.uniform(1.8, 3.0)))
+        scenery.box((0.0, side * _YARD_M[1]), (2.0 * _YARD_M[0], 0.3), (BELOW_M, rng.uniform(1.8, 3.0)))
+        scenery.box((side * _YARD_M[0], 0.0), (0.3, 2.0 * _YARD_M[1]), (BELOW_M, rng.uniform(1.8, 3.0)))
         for x in np.arange(-15.0, 15.1, 6.0):
-            _lean_on(scenery, float(x) + rng.uniform(-1.0, 1.0), side * (_YARD_Y_M - 2.2), rng)
+            _lean_on(scenery, float(x) + rng.uniform(-1.0, 1.0), side * (_YARD_M[1] - 2.2), rng)
         for y in (-7.0, 0.0, 7.0):
-            parked_car(scenery, side * (_YARD_X_M - 3.0), y + rng.uniform(-1.5, 1.5), rng.normal(0.0, 0.1), rng)
+            parked_car(scenery, side * (_YARD_M[0] - 3.0), y + rng.uniform(-1.5, 1.5), rng.normal(0.0, 0.1), rng)
         tree(scenery, side * rng.uniform(10.5, 12.0), rng.uniform(-6.0, 6.0), rng)
     for bearing in np.deg2rad(np.arange(0.0, 360.0, 60.0)) + rng.uniform(-0.4, 0.4, 6):
         x, y = rng.uniform(7.0, 9.5) * np.array([np.cos(bearing), np.sin(bearing)])
