@@ -7,6 +7,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import (
+    first_of_unjoined,
     free_poses,
     has_loop,
     listed,
@@ -208,3 +209,11 @@ def test_edges_skip_poses_that_join_others_than_successive_ones_unless_one_is_a_
 )
 def test_names_in_sequence_are_listed_as_a_range_and_scattered_ones_cut_off(names, text):
     assert listed(np.array(names)) == text
+
+
+def test_the_first_pose_of_every_part_without_a_fixed_one_is_found():
+    edges, fixed = np.array([[5, 1], [2, 4], [4, 2]]), np.zeros(7, np.bool_)
+    assert first_of_unjoined(edges, fixed).tolist() == [0, 1, 2, 3, 6]
+    fixed[[4, 6]] = True
+    assert first_of_unjoined(edges, fixed).tolist() == [0, 1, 3]
+    assert first_of_unjoined(edges[:0], ~fixed | fixed).tolist() == []

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -359,3 +361,229 @@ def test_a_sensor_offset_of_other_lines_keeps_its_id(read, tmp_path):
         assert set(again.other_lines) == {*others, "PARAMS_SE3OFFSET 2 0 0 0 0 0 0 1"}
         assert_same(graph, again.graph)
         others = again.other_lines
+
+
+# as in GTSAM's victoria_park.txt and w20000.txt
+PARK = """\
+ODOMETRY 3 4 1 0 1.5707963267948966 0.01 0 0 0.04 0 0.0001
+LANDMARK 4 5 2 0.5 0.25 0.1 0.5
+ODOMETRY 4 6 1 0 0 0.01 0 0 0.04 0 0.0001
+LANDMARK 6 5 1 0.5 0.4 0 0.4
+"""
+
+
+def test_gtsam_odometry_and_landmarks_are_edges_with_covariances(read):
+    file = read(PARK, "park.txt")
+    assert file.ids.tolist() == [3, 4, 6, 5] and file.graph.is_point.tolist() == [False] * 3 + [True]
+    assert file.graph.edges.tolist() == [[0, 1], [1, 2], [1, 3], [2, 3]]
+    assert np.allclose(file.graph.information[0], np.diag([100, 25, 1e4]))
+    expected = np.array([[0.5, -0.1, 0], [-0.1, 0.25, 0], [0, 0, 0]]) / (0.25 * 0.5 - 0.01)
+    assert np.allclose(file.graph.information[2], expected)
+    assert np.allclose(file.graph.poses[3][:2, 2], [0.5, 2.0])  # left of the turn at (1, 0)
+    (note,) = file.notes
+    assert "park.txt:1: noise of 4 edges read as covariances" in note
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [
+        ("auto", np.diag([0.25, 0.25, 0.2])),
+        ("covariance", np.diag([0.25, 0.25, 0.2])),
+        ("information", np.diag([4, 4, 5])),
+        ("square-root", np.diag([16, 16, 25])),
+    ],
+)
+def test_edges_by_rows_are_covariances_as_in_gtsam_or_what_is_said(noise, expected, read):
+    graph = read("EDGE2 0 1 1 0 0 4 0 0 4 0 5\nEDGE2 1 2 1 0 0 4 0 0 4 0 5\n", noise=noise).graph
+    assert np.allclose(graph.information, expected)
+
+
+@pytest.mark.parametrize("tag", ["EDGE2", "EDGE_SE2", "ODOMETRY"])
+def test_a_square_root_is_by_rows_whatever_its_tag(tag, read):
+    graph = read(f"{tag} 0 1 1 0 0 1 2 3 4 5 6\n", noise="square-root").graph
+    assert np.allclose(graph.information[0], [[1, 2, 3], [2, 20, 26], [3, 26, 70]])
+
+
+def test_a_square_root_in_space_and_covariances_of_priors_are_converted_too(read):
+    entries = np.zeros((6, 6))
+    entries[np.diag_indices(6)] = [10, 10, 10, 100, 100, 25]
+    text = " ".join(map(str, entries[np.triu_indices(6)]))
+    graph = read(f"EDGE3 0 1 1 0 0 0 0 0 {text}\n", noise="square-root").graph
+    assert np.allclose(graph.information[0], np.diag([100, 100, 100, 1e4, 1e4, 625]))
+    graph = read(f"{EDGE}\nEDGE_PRIOR_SE2 1 1 0 0 0.25 0 0 0.25 0 0\n", noise="covariance").graph
+    assert graph.information[1].tolist() == [[4, 0, 0], [0, 4, 0], [0, 0, 0]]
+
+
+def test_bearings_and_ranges_are_edges_to_points_that_begin_where_they_are_seen(read):
+    text = (
+        "VERTEX2 0 1 0 0\nVERTEX2 1 2 0 0\nEDGE2 0 1 1 0 0 1 0 1 1 0 0\nBR 0 144 1.5707963267948966 10 0.02 0.5\n"
+    )
+    file = read(text, "br.graph")
+    assert file.ids.tolist() == [0, 1, 144] and file.has_guess
+    assert np.allclose(file.graph.poses[2][:2, 2], [1, 10])
+    assert np.allclose(file.graph.information[1], np.diag([25, 4, 0]))
+    assert np.allclose(file.graph.information[0], np.eye(3))  # TORO's order, no covariance
+
+
+@pytest.mark.parametrize(
+    ("name", "order", "poses", "points"),
+    [
+        ("w100_30.g2o", "AUTO", 30, 0),
+        ("w100.graph", "TORO", 100, 0),
+        ("example.graph", "AUTO", 95, 24),
+        ("victoria_park.txt", "AUTO", 6969, 151),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_edges_of_the_files_that_gtsam_brings_are_those_that_it_reads(name, order, poses, points):
+    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed")
+    path, form = gtsam.findExampleDataFile(name), getattr(gtsam.NoiseFormat, f"NoiseFormat{order}")
+    theirs = gtsam.load2D(path, None, 0, False, True, form)[0]
+    theirs = [theirs.at(k) for k in range(theirs.size()) if isinstance(theirs.at(k), gtsam.BetweenFactorPose2)]
+    roots = np.array([factor.noiseModel().R() for factor in theirs])
+    ours = read_g2o(path)
+    is_point = ours.graph.is_point[ours.graph.edges[:, 1]]
+    assert ours.ids[ours.graph.edges[~is_point]].tolist() == [list(factor.keys()) for factor in theirs]
+    assert np.allclose(ours.graph.information[~is_point], np.swapaxes(roots, 1, 2) @ roots, rtol=1e-9)
+    assert np.bincount(ours.graph.is_point, minlength=2).tolist() == [poses, points]
+
+
+def test_landmarks_may_have_the_ids_of_poses(read):
+    file = read("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nLANDMARK2 0 1 2 0 1 0 1\nLANDMARK2 1 1 1 0 1 0 1\n")
+    assert file.ids.tolist() == [0, 1, 2] and file.graph.is_point.tolist() == [False, False, True]
+    assert file.graph.edges.tolist() == [[0, 1], [0, 2], [1, 2]]
+    assert "1 landmarks have ids of poses; they are numbered from 2 on" in file.notes[0]
+
+
+def test_a_graph_with_covariances_has_the_minimum_of_the_same_graph_with_information(tmp_path, read):
+    first = read_g2o(shared_data("graphs/intel.g2o"))
+    write_g2o(tmp_path / "same.g2o", first.graph, ids=first.ids)
+    lines = []
+    for line in (tmp_path / "same.g2o").read_text().splitlines():
+        tag, *words = line.split()
+        if tag == "EDGE_SE2":
+            Omega = np.zeros((3, 3))
+            Omega[np.triu_indices(3)] = words[5:]
+            C = np.linalg.inv(Omega + np.triu(Omega, 1).T)
+            line = " ".join(["ODOMETRY", *words[:5], *map(repr, C[np.triu_indices(3)].tolist())])
+        lines.append(line)
+    second = read("\n".join(lines), "same.txt").graph
+    config = load_settings(2).config.graph
+    chi2 = [graph.optimize(config).chi2_after for graph in (first.graph, second)]
+    assert chi2[1] == pytest.approx(chi2[0], rel=1e-6)
+
+
+TRIANGLE = ((0, 1), (1, 2), (2, 0))
+AT = "1 0 2.0 4 0 0 5 0 6"  # of edges of a triangle that does not quite close
+
+
+def triangle(first, measured=AT):
+    return "".join(f"EDGE_SE2 {first + i} {first + j} {measured}\n" for i, j in TRIANGLE)
+
+
+def test_each_part_of_a_graph_that_no_edge_joins_has_a_gauge_of_its_own(read):
+    file, alone = read(triangle(0) + triangle(40)), read(triangle(0)).graph
+    assert file.graph.held == [0, 3] and alone.held == [] and "with 40 fixed" in file.notes[0]
+    config = load_settings(2).config.graph
+    alone.optimize(config)
+    file.graph.optimize(config)
+    assert np.allclose(file.graph.poses[:3], alone.poses) and np.allclose(file.graph.poses[3:], alone.poses)
+    together, single = file.graph.certify(), alone.certify()
+    assert together.certified and together.gap == pytest.approx(2.0 * single.gap, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("lines", "held"),
+    [("FIX 41\n", [0, 4]), ("EDGE_PRIOR_SE2 41 0 0 0 1 0 0 1 0 1\n", [0]), ("FIX 2\nFIX 40\n", [2, 3])],
+)
+def test_a_part_that_a_line_fixes_or_a_prior_holds_needs_no_other_gauge(lines, held, read):
+    assert read(triangle(0) + triangle(40) + lines).graph.held == held
+
+
+def test_a_vertex_without_edges_keeps_its_place(read):
+    vertices = "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in (0, 1, 2, 9))
+    graph = read(vertices + triangle(0)).graph
+    graph.optimize(load_settings(2).config.graph)
+    assert np.array_equal(graph.poses[3], lie.pose_2d(9.0, 0.0, 0.0))
+
+
+PLAIN = triangle(0)
+HUGE = 8646911284551352320  # of x0, as GTSAM packs a character and a number in 64 bits
+
+
+@pytest.mark.parametrize(
+    ("text", "first"),
+    [
+        ("\ufeff" + PLAIN, 0),
+        (PLAIN.replace("\n", "\r\n"), 0),
+        (PLAIN.replace("\n", "\r"), 0),
+        (PLAIN.replace(" ", "\t  "), 0),
+        (triangle(HUGE), HUGE),
+        (triangle(-7), -7),
+        (triangle(2**63 - 3), 2**63 - 3),
+    ],
+    ids=["byte order mark", "Windows", "Macintosh", "tabs", "symbols", "negative", "largest"],
+)
+def test_line_ends_spaces_and_ids_of_any_kind_change_nothing(text, first, tmp_path):
+    (tmp_path / "x.g2o").write_bytes(text.encode())
+    file = read_g2o(tmp_path / "x.g2o")
+    assert file.ids.tolist() == [first, first + 1, first + 2] and file.notes == ()
+    assert file.graph.information[0].tolist() == [[4, 0, 0], [0, 5, 0], [0, 0, 6]]
+
+
+def test_an_edge_that_is_repeated_counts_each_time_and_is_said(read):
+    file = read(PLAIN + PLAIN + "EDGE_SE2 0 1 1 0 2.1 4 0 0 5 0 6\n")
+    assert len(file.graph.edges) == 7
+    assert "3 edges repeated to the digit" in file.notes[0]
+
+
+def test_quaternions_that_are_not_of_unit_length_are_normalized_and_said(read):
+    edge = "EDGE_SE3:QUAT {} {} 1 0 0 0 0 {} {} " + " ".join(map(str, np.eye(6)[np.triu_indices(6)])) + "\n"
+    file = read(edge.format(0, 1, 0, 1.004) + edge.format(1, 2, 3, 3) + edge.format(2, 3, 0, 0.5))
+    assert np.allclose(lie.to_quaternion(file.graph.measurements[1, :3, :3]), [0, 0, 0.5**0.5, 0.5**0.5])
+    (note,) = file.notes
+    assert note.endswith("x.g2o:2: quaternion of length 4.24, the first of 2 to be normalized")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("odom2 0.0 1.0 0.0 0.0 0.1 0.1 0.1\nrange2 0.0 3.1 0.1 1 2 0\n", "libRSF's measurements over time"),
+        (PLAIN.replace(" ", ","), "its first line is 'EDGE_SE2,0,1,1,0,2.0"),
+        (
+            "VERTEX_SE2 0 0 0 0\n" + PLAIN,
+            ":2: vertex 1 is not .*, or remove all VERTEX lines to start from odometry",
+        ),
+        (triangle(2**63), f":1: EDGE_SE2: vertex id '{2**63}' is not a 64-bit integer"),
+        (PLAIN + "EDGE2 1 2 1 0 0\n", ":4: EDGE2 has 5 values, needs 11; it has no information"),
+        ("ODOMETRY 0 1 1 0 0 0 0 0 1 0 1\n", ":1: covariance is not positive definite; .*--noise"),
+        ("ODOMETRY 0 1 1 0 0 1 2 0 1 0 1\n", ":1: covariance is not positive definite"),
+        (PLAIN + "LANDMARK 1 9 1 0 1 1 1\n", ":4: covariance is not positive definite"),
+        (PLAIN + "BR 1 9 1 2 0 0.1\n", ":4: covariance is not positive definite"),
+        (PLAIN + "BR 1 9 1 2 0.1\n", ":4: BR has 5 values, needs 6$"),
+        (PLAIN + "EDGE_SE2 0 2 1 0 0 -4 0 0 5 0 6\n", ":4: information matrix of edge 0-2 is not positive semi"),
+    ],
+)
+def test_a_broken_file_ends_optimize_with_one_line_that_says_what_it_is(text, words, tmp_path, capsys):
+    (tmp_path / "x.g2o").write_text(text)
+    assert main(["optimize", str(tmp_path / "x.g2o"), "--indefinite", "refuse"]) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert re.search(f"x.g2o.*{words}", line) and not captured.out
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_file_with_words_swapped_lost_and_changed_is_read_or_refused_in_one_line(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    words = [line.split() for line in (SQUARE + PARK.replace("LANDMARK", "BR") + PARK + PLAIN).splitlines()]
+    for _ in range(4):
+        row = words[rng.integers(len(words))]
+        column = int(rng.integers(len(row)))
+        with_this = rng.choice(["-1", "nan", "x", "1e400", "", "9" * 20, "0.5", "EDGE2", "BR", "LANDMARK", "FIX"])
+        row[column : column + int(rng.integers(1, 3))] = [str(with_this)]
+    (tmp_path / "x.g2o").write_text("\n".join(map(" ".join, words)))
+    try:
+        graph = read_g2o(tmp_path / "x.g2o").graph
+        assert np.isfinite(graph.poses).all() and positive_semidefinite(graph.information).all()
+    except InputError as error:
+        assert "\n" not in str(error) and "x.g2o" in str(error)

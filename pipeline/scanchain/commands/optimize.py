@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from scanchain.graph.certificate import Certificate
+    from scanchain.graph.edge_noise import Noise
     from scanchain.graph.g2o import G2oFile, Indefinite
     from scanchain.graph.initialize import Initialization
     from scanchain.graph.optimization import GraphChange, Optimization
@@ -59,6 +60,13 @@ _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
     help="Information matrices that are not positive semidefinite: project to the nearest that is, or refuse.",
 )
 @click.option(
+    "--noise",
+    type=click.Choice(("auto", "information", "covariance", "square-root")),
+    default="auto",
+    show_default=True,
+    help="What the matrices in the lines are; auto is information, and covariance where GTSAM has that.",
+)
+@click.option(
     "--marginals",
     metavar="all|IDS",
     help="Write marginal covariances of these poses, in their own frames, to a .marginals.csv next to --out.",
@@ -72,6 +80,7 @@ def optimize(
     out: Path | None,
     initialize: str,
     indefinite: str,
+    noise: str,
     marginals: str | None,
     png: Path | None,
     recording: Path | None,
@@ -81,10 +90,10 @@ def optimize(
 ) -> int:
     """Optimize a pose graph and certify whether the minimum is global.
 
-    GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO file. The certificate is a lower bound of χ² over all poses.
-    Edges rejected by --robust count in no χ²: --out FILE.g2o holds the edges in force, with their robust weights
-    in their information matrices, and FILE_rejected.g2o the rejected ones, if any. Poses that did not converge are
-    written all the same, and the exit code is 1.
+    GRAPH is a g2o file (SE2, SE3:QUAT, XY), a TORO file, or a text file of GTSAM or iSAM. The certificate is a
+    lower bound of χ² over all poses. Edges rejected by --robust count in no χ²: --out FILE.g2o holds the edges in
+    force, with their robust weights in their information matrices, and FILE_rejected.g2o the rejected ones, if
+    any. Poses that did not converge are written all the same, and the exit code is 1.
 
     \b
     Examples:
@@ -110,7 +119,7 @@ def optimize(
             raise InputError(f"{override.flag} has no meaning for optimize; its keys begin with --graph.")
     config = load_settings(overrides=overrides).config.graph
     is_robust = config.robust != "none" and any(override.key == "graph.robust" for override in overrides)
-    file = _read(source, cast("Indefinite", indefinite), is_robust)
+    file = _read(source, cast("Indefinite", indefinite), cast("Noise", noise), is_robust)
     graph, ids, before = file.graph, file.ids, file.graph.state()
     chosen = None if marginals is None else chosen_poses(marginals, ids)
     done = graph.optimize(config, initialize=cast("Initialization", initialize))
@@ -163,13 +172,14 @@ def _write(
     return [str(path) for path in written]
 
 
-def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
+def _read(source: Path, indefinite: Indefinite, noise: Noise, is_robust: bool) -> G2oFile:
     """The graph in the file; warns on stderr if information matrices were projected."""
     from scanchain.graph.g2o import read_g2o
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        file = read_g2o(source, loops="robust" if is_robust else "quadratic", indefinite=indefinite)
+        loops = "robust" if is_robust else "quadratic"
+        file = read_g2o(source, loops=loops, indefinite=indefinite, noise=noise)
     if file.projection is not None:
         remedy = "fix the program that wrote them, or stop here with --indefinite refuse"
         click.echo(f"warning: {source}: {file.projection.text}; {remedy}", err=True)
@@ -225,7 +235,7 @@ class _Report:
     def warnings(self) -> list[str]:
         """Warnings to read before the rest."""
         after, graph = self.change.after, self.file.graph
-        notes = list(filter(None, [self.file.note]))
+        notes = list[str]()
         if graph.left_out:
             notes.append(
                 f"{graph.left_out} not understood: in neither chi2 nor certificate nor covariances; kept in --out"
@@ -245,7 +255,7 @@ class _Report:
                 f"{downweighted:,} of {len(weight):,} loop edges are rejected or have a weight below ½: if they "
                 "are right, all below is wrong; the certificate covers the edges in force, not their selection"
             )
-        return notes
+        return [*notes, *self.file.notes]
 
     @property
     def _chi2(self) -> str:

@@ -12,7 +12,7 @@ from scanchain.clock import working_s
 from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.errors import counted
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
-from scanchain.graph.edge_checks import is_connected
+from scanchain.graph.edge_checks import first_of_unjoined, is_connected
 from scanchain.graph.factors import turns
 from scanchain.graph.problem import GraphProblem
 
@@ -105,7 +105,8 @@ def _gap(
         what = sorted({problem.factors[kind].name for kind in problem.kind[unknown].tolist()})
         return chi2, f"there is no bound for {counted(int(unknown.sum()), 'edge')} of {' and '.join(what)}"
     fixed = np.unique(problem.edges[problem.variable[problem.edges] < 0])
-    if len(fixed) > 1:
+    parts = np.isin(first_of_unjoined(problem.edges, np.zeros(len(poses), np.bool_)), problem.edges)
+    if len(fixed) > parts.sum():  # one in each part of the graph is only its gauge
         held = counted(int((fixed < len(names)).sum()), "pose")
         what = f"the origin and {held}" if fixed[-1] == len(names) else held
         return chi2, f"{what} are fixed; the bound is for one"

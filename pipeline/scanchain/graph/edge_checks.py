@@ -172,6 +172,13 @@ def loose(edges: Integers, fixed: Mask) -> Integers:
     return np.flatnonzero(~np.isin(part, part[fixed]))
 
 
+def first_of_unjoined(edges: Integers, fixed: Mask) -> Integers:
+    """First pose of every component without a fixed pose, ascending."""
+    _, part = _parts(edges, len(fixed))
+    first = np.unique(part, return_index=True)[1]
+    return np.sort(first[~np.isin(part[first], part[fixed])])
+
+
 def has_loop(edges: Integers, pose_count: int) -> bool:
     """True if there are more edges than in a spanning forest."""
     return len(edges) > pose_count - _parts(edges, pose_count)[0]

@@ -1,4 +1,4 @@
-"""Pose graphs in g2o and TORO files: read and written."""
+"""Pose graphs in g2o and TORO files, read and written, and in text files of GTSAM and iSAM, read."""
 
 from __future__ import annotations
 
@@ -18,18 +18,37 @@ from scanchain.checks import LARGEST
 from scanchain.data import Integers, Mask, Matrix, brief
 from scanchain.errors import InputError, counted, shown
 from scanchain.files import write_whole
-from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, skip_poses
+from scanchain.graph.edge_checks import (
+    first_of_unjoined,
+    listed,
+    nearest_semidefinite,
+    positive_semidefinite,
+    skip_poses,
+)
+from scanchain.graph.edge_noise import (
+    BY_ROWS,
+    TORO,
+    Noise,
+    is_invertible,
+    order_of,
+    positions,
+    squared,
+    symmetric,
+)
 from scanchain.graph.factors import Position, Prior
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
 
 _NO_CONSTRAINT = ("#", "VERTEX", "PARAMS", "FIX")  # beginnings of lines that constrain nothing
+_NOT_UNIT = 0.01  # difference of a quaternion's length from 1 above which it is no rounding of the digits
 _WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is more than a full turn, or in degrees
 Rotation = Literal["vector", "quaternion"]  # rotation parametrization of Ω in 3D
 ROTATION_COMMENT: dict[Rotation, str] = {
     "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
     "quaternion": "# information of EDGE_SE3:QUAT is of (translation, vector part of unit quaternion), as g2o",
 }
+_TRIANGLES = (3, 6, 21)  # numbers of entries of the information of edges to points, in the plane, and in space
+_LIBRSF = {"odom2", "odom2diff", "odom3", "range2", "range3", "point2", "point3", "loop"}
 
 
 class Tag(NamedTuple):
@@ -40,6 +59,8 @@ class Tag(NamedTuple):
     columns : indices of its other numbers in a complete line: a pose (x y θ, or x y z qx qy qz qw), and for an
         edge the upper triangle of Ω, row by row. TORO has roll, pitch and yaw instead of the quaternion
     is_point : whether it is a point, or an edge to one
+    is_covariance : whether the upper triangle is that of Ω⁻¹
+    is_landmark : whether it is to a point without a vertex, whose id may be that of a pose too
     """
 
     dimension: int
@@ -47,9 +68,15 @@ class Tag(NamedTuple):
     columns: tuple[int, ...]
     is_point: bool = False
     is_toro: bool = False
+    is_covariance: bool = False
+    is_landmark: bool = False
 
 
 TAGS = {
+    "ODOMETRY": Tag(2, 2, tuple(range(9)), is_covariance=True),  # of GTSAM and iSAM, as LANDMARK and BR
+    "LANDMARK": Tag(2, 2, (0, 1, 3, 4, 6), is_point=True, is_covariance=True, is_landmark=True),
+    "LANDMARK2": Tag(2, 2, (0, 1, 3, 4, 6), is_point=True, is_landmark=True),
+    "BR": Tag(2, 2, (0, 1, 3, 6), is_point=True, is_covariance=True, is_landmark=True),  # bearing, range, σ, σ
     "VERTEX_SE2": Tag(2, 1, (0, 1, 2)),
     "EDGE_SE2": Tag(2, 2, tuple(range(9))),
     "VERTEX_XY": Tag(2, 1, (0, 1), is_point=True),
@@ -110,13 +137,15 @@ class Rows(NamedTuple):
     lines : (n,) line numbers in the file
     ids : (n, 1) or (n, 2) vertex ids
     numbers : (n, m) of complete g2o lines, zero where a tag has no number
-    is_point : (n,) bool, points or edges to points
+    is_point, is_covariance, is_landmark : (n,) bool; is_point also of edges to points
     """
 
     lines: Integers
     ids: Integers
     numbers: Matrix
     is_point: Mask
+    is_covariance: Mask
+    is_landmark: Mask
 
 
 class Lines:
@@ -127,14 +156,14 @@ class Lines:
     between : number of edges without the priors
     fixed : line and vertex id (n, 2) of every fixed pose
     others : lines of other tags
-    note : as in ``G2oFile``
+    notes : as in ``G2oFile``
     rotation : rotation parametrization of the information, from the comment that ``write_g2o`` writes
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.dimension = path, 0
+    def __init__(self, path: Path, noise: Noise) -> None:
+        self.path, self.noise, self.dimension = path, noise, 0
         self.rotation: Rotation = "vector"
-        self.others, self.note = list[str](), ""
+        self.others, self.notes = list[str](), list[str]()
         comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
         fixed, rows, priors = list[tuple[int, int]](), list[_Row](), list[_Row]()
         offsets, sensors = list[tuple[int, list[str]]](), list[tuple[int, int]]()
@@ -159,8 +188,26 @@ class Lines:
         vertices, edges = ([row for row in rows if row[1].ids == n] for n in (1, 2))
         self.vertices, self.edges = self._whole(vertices, 1), self._whole(edges + priors, 2)
         self.between = len(edges)
+        if again := len(edges) - len({(tag, *names, *numbers) for _, tag, names, numbers in edges}):
+            self.notes.append(f"{path}: {counted(again, 'edge')} repeated to the digit; each counts in full")
+        self._separate_landmarks()
         if not edges:
-            raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
+            what = f"its first line is {self.others[0][:40]!r}; " if self.others else ""
+            what += "is it a g2o pose graph?"
+            if any(line.split(maxsplit=1)[0] in _LIBRSF for line in self.others):
+                what = "its lines are libRSF's measurements over time, not between poses; solve them with libRSF"
+            raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; {what}")
+
+    def _separate_landmarks(self) -> None:
+        """Give landmarks ids of their own if some of theirs are also ids of poses."""
+        edges, of_points = self.edges, self.edges.is_landmark
+        names, which = np.unique(edges.ids[of_points, 1], return_inverse=True)
+        poses = np.append(self.vertices.ids[~self.vertices.is_point], edges.ids[~edges.is_point])
+        poses = np.append(poses, edges.ids[of_points, 0])
+        if np.isin(names, poses).any() and (first := int(poses.max()) + 1) < np.iinfo(np.int64).max - len(names):
+            edges.ids[of_points, 1] = first + which
+            text = f"landmarks have ids of poses; they are numbered from {first} on"
+            self.notes.append(f"{self.path}: {len(names):,} {text}")
 
     def error(self, line: object, text: str) -> InputError:
         """An error with this line number."""
@@ -175,8 +222,10 @@ class Lines:
 
     def check_known(self, lines: Integers, names: Integers, is_known: Mask) -> None:
         """Raise InputError for lines (n,) that name vertices (n, w) missing in the file."""
+        without = ", or remove all VERTEX lines to start from odometry" if len(self.vertices.lines) else ""
         for row, column in np.argwhere(~is_known)[:1]:
-            raise self.error(lines[row], f"vertex {names[row, column]} is not in the file; add its VERTEX line")
+            text = f"vertex {names[row, column]} is not in the file; add its VERTEX line"
+            raise self.error(lines[row], text + without)
 
     def poses(self, rows: Rows) -> Matrix:
         """Poses (n, d+1, d+1) that rows x y θ, or x y z qx qy qz qw, begin with; quaternions are normalized."""
@@ -188,16 +237,21 @@ class Lines:
             result[:, 1, 0] = np.sin(numbers[:, 2])
             result[:, 0, 1] = -result[:, 1, 0]
             return result
-        for bad in np.flatnonzero(np.linalg.norm(numbers[:, 3:7], axis=1) < 1e-6)[:1]:
+        length = np.linalg.norm(numbers[:, 3:7], axis=1)
+        for bad in np.flatnonzero(length < 1e-6)[:1]:
             raise self.error(rows.lines[bad], "quaternion of length 0; write qx qy qz qw, 0 0 0 1 for none")
+        off = np.flatnonzero(np.abs(length - 1.0) > _NOT_UNIT)
+        for first in off[:1]:
+            text = f"quaternion of length {length[first]:.3g}, the first of {len(off):,} to be normalized"
+            self.notes.append(f"{self.path}:{rows.lines[first]}: {text}")
         result[:, :3, :3] = lie.from_quaternion(numbers[:, 3:7])
         return result
 
     def _text(self) -> str:
         try:
-            return self.path.read_text(encoding="utf-8")
+            return self.path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not text"
+            reason = getattr(error, "strerror", None) or "not UTF-8 text"
             raise InputError(
                 f"{self.path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
             ) from error
@@ -210,7 +264,8 @@ class Lines:
         self.dimension = tag.dimension
         if len(words) != 1 + tag.ids + len(tag.columns):
             count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
-            raise self.error(line, f"{name} has {count}, needs {wanted}")
+            is_bare = tag.ids == 2 and wanted - len(words) + 1 in _TRIANGLES
+            raise self.error(line, f"{name} has {count}, needs {wanted}{'; it has no information' * is_bare}")
         ids = [self._vertex_id(line, name, word) for word in words[1 : 1 + tag.ids]]
         try:
             numbers = list(map(float, words[1 + tag.ids :]))
@@ -239,9 +294,20 @@ class Lines:
     def _whole(self, rows: list[_Row], ids: int) -> Rows:
         """Vertices or edges as complete g2o lines."""
         numbers = np.zeros((len(rows), _WIDTHS.get((self.dimension, ids), 0)))
+        is_covariance = np.zeros(len(rows), np.bool_)
+        is_landmark = np.array([tag.is_landmark for _, tag, *_ in rows], np.bool_)
         for tag in {row[1] for row in rows}:
             of_tag = [place for place, row in enumerate(rows) if row[1] == tag]
-            numbers[np.ix_(of_tag, tag.columns)] = [rows[place][3] for place in of_tag]
+            of_file, columns = np.array([rows[place][3] for place in of_tag]), tag.columns
+            is_covariance[of_tag] = tag.is_covariance
+            if tag == TAGS["BR"]:
+                of_file, columns = positions(of_file), TAGS["LANDMARK"].columns
+            elif tag in (TAGS["EDGE2"], TAGS["ODOMETRY"]):
+                is_root = self.noise == "square-root"  # as in iSAM, whose lines are all by rows
+                order = BY_ROWS if is_root else order_of(of_file[:, 3:], TORO if tag.is_toro else BY_ROWS)
+                columns = (0, 1, 2, *(3 + entry for entry in order))
+                is_covariance[of_tag] |= order == BY_ROWS
+            numbers[np.ix_(of_tag, columns)] = of_file
         lines = np.array([line for line, *_ in rows], np.int64)
         is_point = np.array([tag.is_point for _, tag, *_ in rows], np.bool_)
         is_toro = np.array([tag.is_toro for _, tag, *_ in rows], np.bool_)
@@ -250,10 +316,11 @@ class Lines:
         if len(rows) and largest.max() > _WHOLE_TURN:
             line = lines[largest.argmax()]
             note = f"{self.path}:{line}: an angle of {largest.max():.6g}; degrees? angles are taken as radians"
-            self.note = self.note or note
+            self.notes += [] if self.notes else [note]
         if self.dimension == 3 and is_toro.any():  # Rz(yaw) Ry(pitch) Rx(roll)
             numbers[is_toro, 3:7] = Turn.from_euler("ZYX", numbers[is_toro, 5:2:-1]).as_quat()
-        return Rows(lines, np.array([row[2] for row in rows], np.int64).reshape(-1, ids), numbers, is_point)
+        names = np.array([row[2] for row in rows], np.int64).reshape(-1, ids)
+        return Rows(lines, names, numbers, is_point, is_covariance, is_landmark)
 
 
 _Row = tuple[int, Tag, list[int], list[float]]  # line, tag, vertex ids, numbers
@@ -384,7 +451,7 @@ class G2oFile:
     other_lines : lines about neither poses nor edges, retained to be written again
     has_guess : whether the file holds vertices; else the graph's poses are chained along its odometry
     projection : of the indefinite information matrices; None without any
-    note : warning that angles may be in degrees; empty if none exceeds a full turn
+    notes : warnings of what in the file may be meant otherwise than read, such as angles in degrees
     """
 
     __repr__ = brief
@@ -393,7 +460,7 @@ class G2oFile:
     other_lines: tuple[str, ...]
     has_guess: bool
     projection: Projection | None
-    note: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
@@ -411,6 +478,7 @@ def read_g2o(
     loops: Literal["quadratic", "robust"] = "quadratic",
     indefinite: Indefinite = "project",
     rotation: Rotation | None = None,
+    noise: Noise = "auto",
 ) -> G2oFile:
     """Read a graph.
 
@@ -419,22 +487,28 @@ def read_g2o(
         semidefinite one and warn, or "refuse" the file
     rotation : rotation parametrization of the information in 3D, as in ``write_g2o``; by default the one stated in
         the file, else "vector"
+    noise : what the upper triangles of the edges and priors are: "information" Ω, "covariance" Ω⁻¹, or
+        "square-root", the upper triangular R with Ω = RᵀR, as in iSAM. By default Ω⁻¹, as in GTSAM, in lines
+        ODOMETRY and LANDMARK, and in EDGE2 lines of which one is indefinite in TORO's order; else Ω
+    Of every component that nothing joins to a fixed pose, the first pose is fixed, with a warning.
     """
     path = checks.path(path, "path")
-    lines = Lines(path)
+    checks.one_of(noise, get_args(Noise), "noise")
+    lines = Lines(path, noise)
     edges, dimension, between = lines.edges, lines.dimension, slice(lines.between)
     ids, is_point, poses = _vertices(lines)
     pairs = _pairs(lines, ids, is_point)
     fixed = lines.indices(lines.fixed[:, 0], lines.fixed[:, 1:], ids)[:, 0]
     is_quaternion = dimension == 3 and (rotation or lines.rotation) == "quaternion"
-    measurements, information = lines.poses(edges), _information(edges, dimension, is_quaternion=is_quaternion)
+    measurements, information = lines.poses(edges), _information(lines, is_quaternion=is_quaternion)
     is_whole = np.asarray(information[:, dimension:].any(axis=(1, 2)))
     projection = _project(lines, information, indefinite)
+    fixed, held = _gauges(lines, ids, pairs, fixed)
     has_guess = bool(len(lines.vertices.lines))
+    chain, to_points = (np.flatnonzero(edges.is_point[between] == point) for point in (False, True))
     if not has_guess:
-        chain, to_points = (np.flatnonzero(edges.is_point[between] == point) for point in (False, True))
-        is_held = np.isin(np.arange(len(ids)), fixed if len(fixed) else 0)
-        poses = follow_odometry(poses, is_held, pairs[chain], measurements[chain])
+        poses = follow_odometry(poses, held, pairs[chain], measurements[chain])
+    if not lines.vertices.is_point.any():  # of landmarks, or without any vertex
         i, j = pairs[to_points].T
         poses[j, :-1, -1] = (poses[i] @ measurements[to_points])[:, :-1, -1]
     constraints = [line for line in lines.others if not line.lstrip().startswith(_NO_CONSTRAINT)]
@@ -450,9 +524,27 @@ def read_g2o(
     for index in fixed.tolist():
         graph.fix(index)
     note = f"{path}: {left_out} not understood: in neither χ² nor certificate nor covariances" if left_out else ""
-    for text in filter(None, (lines.note, note)):
+    for text in filter(None, (*lines.notes, note)):
         warnings.warn(text, stacklevel=2)
-    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
+    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, tuple(lines.notes))
+
+
+def _gauges(lines: Lines, ids: Integers, pairs: Integers, fixed: Integers) -> tuple[Integers, Mask]:
+    """Poses to fix: those of FIX lines, and the first of every component joined to none of them and no prior.
+
+    Also whether each pose (K,) begins where it is: these and, without any FIX line, pose 0.
+    """
+    index, priors = np.arange(len(ids)), pairs[lines.between :, 1]
+    start = fixed if len(fixed) else index[:1]
+    chosen = fixed if len(priors) else start
+    apart = first_of_unjoined(pairs, np.isin(index, np.append(chosen, priors)))
+    if len(apart):
+        fixed, text = (
+            np.append(chosen, apart),
+            f"with {listed(ids[apart])} fixed; poses of different parts do not compare",
+        )
+        lines.notes.append(f"{lines.path}: parts that no edge joins to the rest have a gauge of their own, {text}")
+    return fixed, np.isin(index, np.append(start, apart))
 
 
 def _pairs(lines: Lines, ids: Integers, is_point: Mask) -> Integers:
@@ -472,12 +564,26 @@ def _pairs(lines: Lines, ids: Integers, is_point: Mask) -> Integers:
     return pairs
 
 
-def _information(rows: Rows, dimension: int, *, is_quaternion: bool) -> Matrix:
-    """Information (n, k, k) at the end of rows of edges."""
-    k = 3 if dimension == 2 else 6
-    information = np.zeros((len(rows.lines), k, k))
-    a, b = np.triu_indices(k)
-    information[:, a, b] = information[:, b, a] = rows.numbers[:, -len(a) :]
+def _information(lines: Lines, *, is_quaternion: bool) -> Matrix:
+    """Information (n, k, k) from the upper triangles at the end of the rows of edges."""
+    edges, d, noise = lines.edges, lines.dimension, lines.noise
+    information = symmetric(edges.numbers[:, -6 if d == 2 else -21 :])
+    is_covariance = edges.is_covariance if noise == "auto" else np.full(len(information), noise == "covariance")
+    is_position = ~information[:, d:].any(axis=(1, 2))
+    for chosen, m in ((is_covariance & ~is_position, information.shape[1]), (is_covariance & is_position, d)):
+        rows, C = np.flatnonzero(chosen), information[chosen, :m, :m]
+        for line in edges.lines[rows[~is_invertible(C)]][:1]:
+            raise lines.error(
+                line, "covariance is not positive definite; correct it, or say with --noise what it is"
+            )
+        inverse = np.linalg.inv(C)
+        information[chosen, :m, :m] = 0.5 * (inverse + np.swapaxes(inverse, 1, 2))
+    if noise == "square-root":
+        information = squared(information)
+    elif noise == "auto" and is_covariance.any():
+        rows, order = np.flatnonzero(is_covariance), "covariances (xx xy xθ yy yθ θθ), as GTSAM has them"
+        text = f"noise of {counted(len(rows), 'edge')} read as {order}; --noise information or square-root if not"
+        lines.notes.append(f"{lines.path}:{edges.lines[rows[0]]}: {text}")
     if is_quaternion:
         units = lie.by_component(6, 1.0, 0.5)
         information *= np.outer(units, units)
@@ -509,7 +615,8 @@ def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Proje
 def _vertices(lines: Lines) -> tuple[Integers, Mask, Matrix]:
     """Ids (K,), of poses and then of points, each ascending; is_point (K,); and poses (K, d+1, d+1).
 
-    Without vertex lines the ids are those in the edges, and the poses are the identity.
+    Without vertex lines the ids are those in the edges, and the poses are the identity; so are the points of
+    LANDMARK and BR lines, whose format has no vertices of points.
     """
     vertices = lines.vertices
     if not len(vertices.lines):
@@ -521,10 +628,14 @@ def _vertices(lines: Lines) -> tuple[Integers, Mask, Matrix]:
     else:
         order = np.lexsort((vertices.ids[:, 0], vertices.is_point))
         ids, is_point, poses = vertices.ids[order, 0], vertices.is_point[order], lines.poses(vertices)[order]
+        edges, of_file = lines.edges, vertices.ids[vertices.is_point]
+        seen = np.setdiff1d(edges.ids[edges.is_landmark, 1], of_file)
         again = order[1:][(ids[1:] == ids[:-1]) & (is_point[1:] == is_point[:-1])]
         for row in np.sort(again)[:1]:
             name = vertices.ids[row, 0]
             raise lines.error(vertices.lines[row], f"vertex {name} is in the file twice; remove one")
+        ids, is_point = np.append(ids, seen), np.append(is_point, np.ones(len(seen), np.bool_))
+        poses = np.concatenate([poses, np.tile(lie.identity(lines.dimension), (len(seen), 1, 1))])
     for name in np.intersect1d(ids[is_point], ids[~is_point])[:1]:
         raise InputError(f"{lines.path}: vertex {name} is a pose and a point; give each an id of its own")
     return ids, is_point, poses
