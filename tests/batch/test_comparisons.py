@@ -5,9 +5,11 @@ import re
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
 
 import scanchain
+from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.batch.comparisons import compare_each, logs_of, publish
 from scanchain.comparison.methods import Variation, resolve
@@ -161,6 +163,39 @@ def test_a_topic_holds_for_the_logs_that_have_it(logs, settings, tmp_path):
     overall = compare([logs[0], town], tmp_path / "out", settings, **given)
     assert [log.table.topic for log in overall.logs] == ["/scan", topic]
     assert f"{logs[0]}: has no topic {topic}; its own lidar is used" in given["progress"].lines
+
+
+def test_the_kitti_benchmark_is_a_folder_of_logs(tmp_path, capfd):
+    """Two simulated drives in its layout, poses in the frame of the camera."""
+    T_camera_lidar = np.array(
+        [[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.2], [1.0, 0.0, 0.0, -0.3], [0.0, 0.0, 0.0, 1.0]]
+    )
+    (tmp_path / "poses").mkdir()
+    true = {}
+    for seed, name in enumerate(("00", "05")):
+        log = made.log("town", seconds=3, seed=seed, sensor="vlp-16")
+        sequence = tmp_path / "sequences" / name
+        (sequence / "velodyne").mkdir(parents=True)
+        scans = list(scanchain.open_log(log))
+        for k, scan in enumerate(scans):
+            rows = np.column_stack([scan.points, np.zeros(len(scan.points))]).astype("<f4")
+            rows.tofile(sequence / "velodyne" / f"{k:06d}.bin")
+        (sequence / "times.txt").write_text("".join(f"{0.1 * k:e}\n" for k in range(len(scans))))
+        (sequence / "calib.txt").write_text("Tr: " + " ".join(f"{x:e}" for x in T_camera_lidar[:3].ravel()) + "\n")
+        true[name] = scanchain.read_tum(log.with_suffix(".tum")).poses[: len(scans)]
+        from_first = T_camera_lidar @ lie.between(true[name][0], true[name]) @ lie.inverse(T_camera_lidar)
+        np.savetxt(tmp_path / "poses" / f"{name}.txt", from_first[:, :3].reshape(-1, 12))
+    own = tmp_path / "own.toml"
+    own.write_text('[mine]\nmethod = "bad_odometries:Shifted"\n')
+    words = ["compare", str(tmp_path / "sequences"), "--methods", "plicp,mine", "--config", str(own)]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    tables = {path.parent.name[:2]: read_table(path.parent) for path in (tmp_path / "out").glob(f"*/{TABLE_FILE}")}
+    assert tables.keys() == true.keys()
+    for name, table in tables.items():
+        assert table.scans == len(true[name]) and table.truth == "/ground_truth"
+        ours, mine = table.rows
+        assert ours.figures["ate_m"] < 0.05 < mine.figures["ate_m"]
+    assert "plicp    2/2" in capfd.readouterr().out
 
 
 def test_a_directory_or_a_site_that_holds_something_else_is_left_alone(logs, settings, tmp_path):
