@@ -1,6 +1,7 @@
 """Trajectory files: what is written is read back, exactly in time."""
 
 import sys
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -121,3 +122,11 @@ def test_files_that_are_none_and_kitti_lines_that_are_no_pose_are_one_line_error
         (tmp_path / "bad.txt").write_text(f"{line}\n")
         with pytest.raises(InputError, match=r"bad\.txt:1"):
             read_kitti(tmp_path / "bad.txt")
+
+
+def test_a_notebook_shows_the_path_as_svg():
+    trajectory = Trajectory(np.arange(3), np.stack([lie.pose_2d(k, 0.5 * k, 0.0) for k in range(3)]))
+    shown = ElementTree.fromstring(trajectory._repr_html_())
+    assert shown.tag.endswith("svg")
+    texts = " ".join(trajectory._repr_html_().split())
+    assert "Trajectory(3 poses of SE(2) over 0.0 s)" in texts and "x [m]" in texts

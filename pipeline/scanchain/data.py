@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from io import StringIO
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
@@ -673,6 +674,15 @@ class Trajectory:
             axes = pyplot.figure().add_subplot(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         axes.plot(*self.positions[:, :2].T)
         return axes
+
+    def _repr_html_(self) -> str:
+        """The path as SVG, which a notebook shows."""
+        from matplotlib.figure import Figure
+
+        figure, file = Figure(figsize=(5.0, 4.0), layout="constrained"), StringIO()
+        self.plot(figure.add_subplot(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=repr(self)))
+        figure.savefig(file, format="svg")
+        return file.getvalue()[file.getvalue().index("<svg") :]
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

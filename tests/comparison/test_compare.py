@@ -7,6 +7,7 @@ import pickle
 import re
 import subprocess
 import sys
+from html import unescape
 
 import msgspec
 import numpy as np
@@ -369,6 +370,7 @@ def test_a_method_for_clouds_alone_is_a_row_that_says_so_on_planar_scans(office,
     genz, mine = table.rows
     assert (genz.status, genz.reason) == (Status.NOT_APPLICABLE, "is made for 3D clouds, and the log is 2D")
     assert mine.status is Status.OK and not Compared(tmp_path, table).failures
+    assert unescape(Compared(tmp_path, table)._repr_html_()) == f"<pre>{text(table)}</pre>"
     assert "genz-icp: not applicable: is made for 3D clouds" in text(table)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from scanchain.ahead import compile_ahead
 from scanchain.comparison.methods import Variation, default_names, resolve, shared_settings
 from scanchain.comparison.processes import StoredScans, run_all, store
 from scanchain.comparison.results import Reference, results_of, summarize, write_results
-from scanchain.comparison.table import Table, write_table
+from scanchain.comparison.table import Table, text, write_table
 from scanchain.config import NO_TOPIC
 from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError, counted
@@ -43,6 +44,10 @@ class Compared:
     def failures(self) -> list[str]:
         """Names of the methods that started and failed."""
         return [row.name for row in self.table.rows if row.status.is_failure]
+
+    def _repr_html_(self) -> str:
+        """The table, which a notebook shows."""
+        return f"<pre>{escape(text(self.table))}</pre>"
 
 
 def compare(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from time import perf_counter
 
@@ -26,7 +27,7 @@ from scanchain.runs.resume import Checkpoints, read_checkpoint, rescued
 from scanchain.slam import Slam, SlamResult
 from scanchain.steps import Steps
 from scanchain.threads import threads
-from scanchain.trajectory import write_wide_tum
+from scanchain.trajectory import read_tum, write_wide_tum
 from scanchain.verdict import Judged
 
 
@@ -48,6 +49,10 @@ class Finished:
             reason = next((each for each in self.warnings if each.startswith("no accuracy")), "no ground truth")
             raise InputError(f"{self.path}: {reason}; name a file by ground_truth, or a topic of the log")
         return self.metrics.ground_truth.optimized
+
+    def _repr_html_(self) -> str:
+        """Summary and path, which a notebook shows."""
+        return f"<pre>{escape(self.summary)}</pre>{read_tum(self.path)._repr_html_()}"
 
 
 def run(
