@@ -4,6 +4,7 @@ import importlib.util
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -122,3 +123,31 @@ def test_a_scan_waits_for_the_imu_and_parameters_are_keys_of_the_configuration(r
         saved += [stamp.to_nsec() for stamp, _ in pipeline.saved_estimates()]
     scans = [each.stamp.to_nsec() for each in measurements if isinstance(each, LidarMeasurement)]
     assert saved == scans[: len(saved)] and len(saved) >= len(scans) - 1
+
+
+def test_every_scan_has_its_imu_where_a_sample_falls_on_the_end_of_a_sweep(monkeypatch):
+    """Scans at 10 Hz, whose last point has the stamp of the next scan, and samples at 200 Hz."""
+    from evalio.types import Duration, ImuMeasurement, LidarMeasurement, Point, Stamp
+
+    from scanchain.evalio import ScanchainPipeline
+
+    pipeline, given = ScanchainPipeline(), []
+    pipeline.initialize()
+
+    def process(scan):
+        given.append(None if scan.inertial is None else scan.inertial.stamps_ns)
+        return SimpleNamespace(T_odom_lidar=np.eye(4))
+
+    monkeypatch.setattr(pipeline.slam, "process", process)
+    points = [Point(x=1.0 + k, y=1.0, z=1.0, t=Duration.from_nsec(10_000_000 * k)) for k in range(11)]
+    for stamp_ns in range(0, 450_000_000, 5_000_000):
+        stamp = Stamp.from_nsec(stamp_ns)
+        pipeline.add_imu(ImuMeasurement(stamp, np.zeros(3), np.zeros(3)))
+        if stamp_ns % 100_000_000 == 0:
+            pipeline.add_lidar(LidarMeasurement(stamp, points))
+    assert len(given) == 4
+    np.testing.assert_array_equal(np.concatenate(given), np.arange(0, 405_000_000, 5_000_000))
+    assert all(each[-1] >= 100_000_000 * (k + 1) for k, each in enumerate(given))
+    before = len(pipeline.samples)
+    pipeline.add_imu(ImuMeasurement(Stamp.from_nsec(5_000_000), np.zeros(3), np.zeros(3)))  # late: left out
+    assert len(pipeline.samples) == before

@@ -42,6 +42,7 @@ class ScanchainPipeline(Pipeline):
         self.params = self.default_params()
         self.T_lidar_imu = np.eye(4)
         self.samples: list[tuple[int, Vector, Vector]] = []
+        self.last_imu_ns: int | None = None  # stamp of the latest sample; None without an IMU
         self.waiting: Scan | None = None
 
     @staticmethod
@@ -92,8 +93,9 @@ class ScanchainPipeline(Pipeline):
     def add_imu(self, mm: ImuMeasurement) -> None:
         """Add a sample; those not later than one before are left out."""
         stamp_ns = mm.stamp.to_nsec()
-        if not self.samples or stamp_ns > self.samples[-1][0]:
+        if self.last_imu_ns is None or stamp_ns > self.last_imu_ns:
             self.samples.append((stamp_ns, mm.gyro, mm.accel))
+            self.last_imu_ns = stamp_ns
         if self.waiting is not None and stamp_ns >= _end_ns(self.waiting):
             self._process(self.waiting)
 
@@ -105,7 +107,7 @@ class ScanchainPipeline(Pipeline):
         valid = np.isfinite(points).all(axis=1) & points.any(axis=1)
         stamp_ns, dropped = mm.stamp.to_nsec(), len(points) - int(np.count_nonzero(valid))
         self.waiting = Scan(-1, stamp_ns, stamp_ns, points[valid], times_s[valid], dropped, None)
-        if not self.samples or self.samples[-1][0] >= _end_ns(self.waiting):
+        if self.last_imu_ns is None or self.last_imu_ns >= _end_ns(self.waiting):
             self._process(self.waiting)
 
     def map(self) -> dict[str, list[Any]]:

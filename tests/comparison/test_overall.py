@@ -7,7 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from scanchain.comparison.overall import ComparedLog, overall_of, overall_text, write_overall
+from scanchain.comparison.overall import (
+    ComparedLog,
+    overall_of,
+    overall_text,
+    sensitivity,
+    variation_folder,
+    write_overall,
+)
 from scanchain.comparison.processes import Status
 from scanchain.comparison.table import COLUMNS, Row, Table
 from scanchain.runs.provenance import describe_start
@@ -102,6 +109,18 @@ def test_the_friedman_test_tells_a_method_that_is_always_better():
     apart = alike + np.array([[0.0], [2.0], [4.0]])
     assert overall_of(logs_of(alike.tolist())).friedman_p > 0.05
     assert overall_of(logs_of(apart.tolist())).friedman_p < 1e-4
+    assert overall_of(logs_of([[0.1, 0.2]] * 3)).friedman_p is None  # all tie
+
+
+def test_the_sensitivity_is_that_of_methods_that_never_failed():
+    """One that fails on the hard logs would else look better there."""
+    varied = {
+        "1": overall_of(logs_of([[0.1, 0.2, 5.0, 6.0]])),
+        "2": overall_of(logs_of([[0.1, 0.2, FAILED, FAILED]])),
+    }
+    _, names, values = sensitivity(varied)
+    assert names == ["a"] and values[0, 0] == 2.6 and np.isnan(values[1, 0])
+    assert variation_folder("log.topic", "/../../x") == "vary/log.topic=%2F..%2F..%2Fx"
 
 
 def test_logs_without_truth_have_no_part_in_ranks_and_wins():
@@ -121,9 +140,13 @@ def test_a_truth_that_is_worse_than_the_methods_is_doubted():
         "rtk", *(row(name, ate, apart) for name, ate, apart in (("a", 0.1, 0.1), ("b", 0.2, 0.2), ("c", 0.1, 0.1)))
     )
     assert worse.doubt == (
-        "gps: the methods are 0.4 m from the ground truth, but 0.1 m from each other (medians), so it may be "
-        "worse than they are"
+        "gps: all methods are 0.3 m and more from the ground truth, but 0.1 m from each other (median), so it may "
+        "be worse than they are"
     )
+    one_is_right = (("a", 0.01, 1.0), ("b", 1.0, 0.1), ("c", 1.05, 0.1), ("d", 0.98, 0.1))
+    assert not log("gps", *(row(*each) for each in one_is_right)).doubt
+    alike = [row(name, 0.4, 0.001) for name in ("plicp", "svd", "plicp+loops")]  # no three independent methods
+    assert not log("gps", *alike).doubt and log("gps", *alike, row("a", 0.5, 0.1), row("b", 0.4, 0.1)).doubt
     assert not better.doubt and not log("bare", row("a", None), row("b", None), row("c", None)).doubt
     assert worse.doubt in overall_of([worse, better]).notes
 

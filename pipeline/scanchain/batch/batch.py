@@ -180,22 +180,26 @@ def on_cluster(
     """Runner of tasks on a Ray cluster with access to the same files, one core per task; retries if a node dies.
 
     address : of the cluster's head node, or "auto" for the cluster that this machine belongs to
-    has_whole_node : whether a task has a node to itself instead, as where times are measured
+    has_whole_node : whether a task has one of the largest nodes to itself instead, as where times are measured
     Raises MissingExtraError without Ray, InputError where no cluster responds.
     """
     try:
         import ray
     except ImportError:
         raise MissingExtraError("ray", "cluster") from None
-    try:
-        ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"--ray is {address!r}: {reason}; start a cluster with ray start --head") from None
-    cores = min((node["Resources"].get("CPU", 1) for node in ray.nodes()), default=1) if has_whole_node else 1
-    remote = ray.remote(num_cpus=cores, max_retries=_NODE_LOSSES)(attempt)
+
+    def connect() -> None:
+        try:
+            ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"--ray is {address!r}: {reason}; start a cluster with ray start --head") from None
 
     def work(tasks: Sequence[T]) -> Iterator[R]:
+        connect()  # anew after an earlier call
+        nodes = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
+        cores = max(nodes, default=1.0) if has_whole_node else 1.0
+        remote = ray.remote(num_cpus=cores, max_retries=_NODE_LOSSES)(attempt)
         waiting = [remote.remote(task) for task in tasks]
         try:
             while waiting:
@@ -206,6 +210,7 @@ def on_cluster(
                 ray.cancel(each, force=True)
             ray.shutdown()
 
+    connect()
     return work
 
 

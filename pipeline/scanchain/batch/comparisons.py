@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from scanchain.baselines import BASELINES
 from scanchain.batch.batch import check_out, collect
 from scanchain.batch.task import key_of
 from scanchain.comparison.compare import compare
@@ -30,7 +31,7 @@ from scanchain.logs.opening import index_files
 from scanchain.logs.stream import are_parts
 from scanchain.logs.topics import topics_of
 from scanchain.runs.job import Progress
-from scanchain.runs.provenance import identity_of
+from scanchain.runs.provenance import identity_of, package_version
 from scanchain.settings import Override, named
 
 _STOPPED = "not compared: stopped by the user"
@@ -55,12 +56,11 @@ Work = Callable[[Sequence[Task]], Iterator[tuple[Task, str]]]
 def attempt(task: Task, progress: Progress | None = None) -> tuple[Task, str]:
     """Compare on a log; with the reason why there is no result, which is empty where there is one."""
     try:
-        compare(task.files, task.folder, task.present, progress or Progress(), force=True, **task.given)
+        compare(
+            task.files, task.folder, task.present, progress or Progress(), force=True, needs_all=True, **task.given
+        )
     except ScanchainError as error:
         return task, error.text.removeprefix(f"{task.files[0]}: ")
-    if progress is not None and progress.stopped:  # the table of a part of the log is no result
-        shutil.rmtree(task.folder)
-        raise KeyboardInterrupt
     return task, ""
 
 
@@ -102,11 +102,12 @@ def compare_each(
     On Ctrl-C the log in progress is discarded, and those not begun are listed as such. A log that cannot be read
     is listed with the reason. Raises InputError for a directory that holds something else.
     """
+    out = out.absolute()
     check_out(out, [file for files in logs for file in files], "a comparison of several logs", OVERALL_FILE)
     out.mkdir(parents=True, exist_ok=True)
     tasks = [_task(files, out, present, given | _topic_of(files, given, progress)) for files in logs]
-    reasons = {task.folder: _STOPPED for task in tasks}
     waiting = [task for task in tasks if force or not (task.folder / TABLE_FILE).is_file()]
+    reasons = {task.folder: _STOPPED if task in waiting else "" for task in tasks}
     if kept := len(tasks) - len(waiting):
         progress.announce(f"{kept:,} of {len(tasks):,} logs are compared already")
     if not (out / OVERALL_FILE).exists():  # marks the directory, before a kill too
@@ -140,15 +141,21 @@ def vary_each(
 
 
 def _task(files: tuple[Source, ...], out: Path, present: Callable[[Path], None], given: dict[str, Any]) -> Task:
-    stem, own = files[0].resolve().stem, dict(given)
+    """The task of a log, with absolute paths: workers of a cluster have other working directories."""
+    files = tuple(file.absolute() if isinstance(file, Path) else file for file in files)
+    first, own, others = files[0].resolve(), dict(given), list[Source]()
+    stem = first.name if isinstance(first, Path) and first.is_dir() else first.stem
     for key in ("ground_truth", "relations"):
         if given.get(key) is not None:
-            own[key] = Path(str(given[key]).replace("{}", stem))
-    identity = [identity_of(file) or spelled(str(file)) for file in files]
+            own[key] = Path(str(given[key]).replace("{}", stem)).absolute()
+            others.append(own[key])
+    identity = [identity_of(file) or spelled(str(file)) for file in (*files, *others)]
     file = given.get("config_file")
     key = key_of("\0".join(identity), None, (*shared_settings(file), *given.get("overrides", ())))
     rest = {name: value for name, value in own.items() if name not in ("overrides", "command", "config_file")}
-    text = f"{key} {sorted(rest.items())} {'' if file is None else file.read_text(encoding='utf-8')}"
+    packages = sorted({"evalio", *(entry.package for entry in BASELINES.values())})
+    versions = [package_version(name) for name in packages]
+    text = f"{key} {versions} {sorted(rest.items())} {'' if file is None else file.read_text(encoding='utf-8')}"
     return Task(files, out / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:8]}", present, own)
 
 
@@ -167,18 +174,18 @@ def _topic_of(files: Sequence[Source], given: Mapping[str, Any], progress: Progr
 
 
 def _compared(task: Task, reason: str) -> ComparedLog:
-    is_done = (task.folder / TABLE_FILE).is_file()
-    name, folder = task.files[0].name, task.folder.name
-    return ComparedLog(name, folder, read_table(task.folder) if is_done else None, "" if is_done else reason)
+    return ComparedLog(task.files[0].name, task.folder.name, None if reason else read_table(task.folder), reason)
+
+
+def check_site(site: Path, out: Path) -> None:
+    """Raise InputError for a folder that holds something else than a site of comparisons."""
+    is_free = not site.exists() or (site.is_dir() and (not any(site.iterdir()) or (site / OVERALL_FILE).is_file()))
+    if not is_free or site.resolve() == out.resolve():
+        raise InputError(f"{site}: is not a site of comparisons; choose another --site")
 
 
 def publish(out: Path, overall: Overall, site: Path) -> None:
-    """Copy pages, recordings and tables into a folder that a web server can serve as it is.
-
-    Raises InputError for a folder that holds something else.
-    """
-    if site.exists() and not (site.is_dir() and (not any(site.iterdir()) or (site / _INDEX).is_file())):
-        raise InputError(f"{site}: exists and is not a site of comparisons; choose another --site")
+    """Copy pages, recordings and tables into a folder that a web server can serve as it is."""
     site.mkdir(parents=True, exist_ok=True)
     for log in overall.logs:
         shutil.rmtree(site / log.folder, ignore_errors=True)

@@ -18,20 +18,21 @@ from scanchain.files import Source
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
+    from scanchain.comparison.methods import Variation
     from scanchain.comparison.overall import Overall
 
 Varied = Mapping[str, Mapping[str, "Overall"]]  # by key and value of --vary
 
 
-def _variations(_: object, __: object, words: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Keys and values of ``--vary``."""
-    found = []
+def _variations(_: object, __: object, words: Sequence[str]) -> dict[str, list[str]]:
+    """Values of ``--vary`` by key."""
+    found: dict[str, list[str]] = {}
     for word in words:
         key, values = word.partition("=")[::2]
         listed = [value.strip() for value in values.split(",") if value.strip()]
         if not listed:
             raise InputError(f"--vary {word}: wanted KEY=VALUE,VALUE, as --vary every=1,2,5")
-        found.append((key.removeprefix("--").strip(), listed))
+        found.setdefault(key.removeprefix("--").strip(), []).extend(listed)
     return found
 
 
@@ -183,7 +184,7 @@ def compare(
     out: Path | None,
     site: Path | None,
     ray: str | None,
-    vary: list[tuple[str, list[str]]],
+    vary: dict[str, list[str]],
     as_json: bool,
     **given: Any,
 ) -> None:
@@ -241,7 +242,7 @@ def compare(
       scanchain compare 00.mcap 05.mcap 07.mcap --gt 'truth/{}.tum' --out runs/kitti
     """
     from scanchain.batch.batch import on_cluster
-    from scanchain.batch.comparisons import attempt, compare_each, logs_of, vary_each
+    from scanchain.batch.comparisons import attempt, check_site, compare_each, logs_of, vary_each
     from scanchain.commands.terminal import Terminal
     from scanchain.comparison.compare import compare as run_comparison
     from scanchain.comparison.methods import Variation, shared_settings
@@ -250,19 +251,19 @@ def compare(
 
     of_log = (*shared_settings(given["config_file"]), *given["overrides"])
     each = logs_of(logs, load_settings(overrides=of_log).config.log.format)
-    for key, value in ((key, value) for key, values in vary for value in values):  # refused before anything is run
-        load_settings(overrides=(*of_log, *Variation(key, value).overrides))
     out = out or Path("runs") / f"compare-{logs[0].stem if len(each) == 1 else 'all'}"
-    given |= {
-        "methods": [name.strip() for name in (methods or "").split(",") if name.strip()],
-        "command": sys.argv,
-    }
+    names = [name.strip() for name in (methods or "").split(",") if name.strip()]
+    if site is not None:
+        check_site(site, out)
+    for key, value in ((key, value) for key, values in vary.items() for value in values):
+        _check_variation(Variation(key, value), names, given)
+    given |= {"methods": names, "command": sys.argv}
     with Terminal("scans") as terminal:
         if len(each) > 1 or site is not None or ray is not None or vary:
             work = None if ray is None else on_cluster(ray, attempt, has_whole_node=True)
             given |= {"present": present_comparison, "progress": terminal, "work": work}
             overall = compare_each(each, out, **given)
-            varied = vary_each(dict(vary), out, overall, partial(compare_each, each, **given))
+            varied = vary_each(vary, out, overall, partial(compare_each, each, **given))
             _end(overall, varied, out, site, as_json)
             return
         compared = run_comparison(each[0], out, present_comparison, terminal, **given)
@@ -271,6 +272,19 @@ def compare(
         click.echo(f"written {out}: report.html, compare.rrd, tables")
     if compared.failures:
         raise ScanchainError(f"did not finish: {', '.join(compared.failures)}; see the table for the reason")
+
+
+def _check_variation(variation: Variation, names: Sequence[str], given: dict[str, Any]) -> None:
+    """Raise InputError, before anything is run, for a variation that fits neither clouds nor laser scans."""
+    from scanchain.comparison.methods import default_names, resolve, shared_settings
+
+    file, overrides, matcher = given["config_file"], given["overrides"], given["matcher"]
+    load_settings(overrides=(*shared_settings(file), *overrides, *variation.of_log))
+    options = {"file": file, "overrides": overrides, "matcher": matcher, "variation": variation}
+    try:
+        resolve(names or default_names(3, has_imu=True), 3, **options)
+    except InputError:
+        resolve(names or default_names(2), 2, **options)
 
 
 def _end(overall: Overall, varied: Varied, out: Path, site: Path | None, as_json: bool) -> None:

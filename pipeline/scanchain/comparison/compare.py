@@ -68,6 +68,7 @@ def compare(
     force: bool = False,
     command: Sequence[str] = (),
     variation: Variation | None = None,
+    needs_all: bool = False,
 ) -> Compared:
     """Run methods on a log and write the directory ``out``; ``present`` adds report and recording to it.
 
@@ -78,10 +79,11 @@ def compare(
     repeat : runs of every method, interleaved
     time_s, memory_mib : limits of a run; None for the default ones
     variation : a setting with another value, for the methods that have it
+    needs_all : whether a log whose reading the user stops is not compared; else its scans so far are
     Raises InputError for bad input before anything is run.
     """
     directory = RunDirectory(out, force=force, sources=logs, command=command)
-    of_log = (*shared_settings(config_file), *overrides, *(variation.overrides if variation else ()))
+    of_log = (*shared_settings(config_file), *overrides, *(variation.of_log if variation else ()))
     log = open_log(logs, load_settings(overrides=of_log).config.log)
     choose_point_times(log)
     settings = load_settings(log.dimension, overrides=of_log)
@@ -100,6 +102,8 @@ def compare(
             decoded, log.T_base_lidar, shared / "scans",
             is_mounted=log.stated_mounting is not None, distorted_share=log.distorted_share,
         )  # fmt: skip
+        if progress.stopped and needs_all:
+            raise KeyboardInterrupt
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )

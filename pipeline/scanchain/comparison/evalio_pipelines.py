@@ -194,6 +194,8 @@ class ScanLines:
 
     def _of(self, points: Matrix) -> NDArray[np.int16]:
         """Line of each point (N,)."""
+        if not len(points):
+            return np.empty(0, np.int16)
         if len(self.edges):
             return np.searchsorted(self.edges, _elevations(points)).astype(np.int16)
         azimuths = np.arctan2(points[:, 1], points[:, 0])

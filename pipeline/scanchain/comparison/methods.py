@@ -60,22 +60,34 @@ class Variation(NamedTuple):
     value: str
 
     @property
-    def overrides(self) -> tuple[Override, ...]:
-        """What it sets for the log and for ours; none where only other methods have the key."""
+    def _keys(self) -> list[str]:
+        """Keys of the configuration of that name: those of methods, or else of the log and the rest."""
         found = [key for key in config_keys() if self.key in (key, key.rpartition(".")[2])]
-        own = [key for key in found if key.partition(".")[0] not in _SHARED] or found
-        if len(own) > 1:
-            raise InputError(f"--vary {self.key}: there are several, {' and '.join(own)}; give one of them")
-        return tuple(Override(key, self.value, f"--vary {self.key}") for key in own)
+        return [key for key in found if key.partition(".")[0] not in _SHARED] or found
+
+    @property
+    def overrides(self) -> tuple[Override, ...]:
+        """What it sets for ours; none where only other methods have the key."""
+        if len(self._keys) > 1:
+            raise InputError(f"--vary {self.key}: there are several, {' and '.join(self._keys)}; give one of them")
+        return tuple(Override(key, self.value, f"--vary {self.key}") for key in self._keys)
+
+    @property
+    def of_log(self) -> tuple[Override, ...]:
+        """What it sets for the log, and so for all methods."""
+        return self.overrides if [key for key in self._keys if key.startswith("log.")] else ()
 
     def of(self, method: Method, dimension: int) -> Method | None:
         """The method with this setting, None for one that has no such key."""
-        keys = [each.key for each in self.overrides]
-        if method.is_ours or any(key.startswith("log.") for key in keys):
-            return method if keys else None
+        if method.is_ours or self.of_log:
+            return method if self.overrides else None
         if self.key not in method.settings:
             return None
-        own = method.settings | {self.key: tomllib.loads(f"value = {self.value}")["value"]}
+        try:
+            value = tomllib.loads(f"value = {self.value}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = self.value
+        own = method.settings | {self.key: value}
         if (entry := entry_of(method.base)) is not None:
             own = _their_settings(entry, own, dimension, f"--vary {self.key}")
         return msgspec.structs.replace(method, settings=own)
@@ -124,7 +136,8 @@ def resolve(
         )
     if len(set(names)) < len(names):
         raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --config instead")
-    overrides = (*overrides, *(variation.overrides if variation else ()))
+    has_ours = any(str(tables.get(name, {}).get(_BASE, name)) in OURS for name in names)
+    overrides = (*overrides, *(variation.overrides if variation and has_ours else ()))
     for override in overrides:
         if override.key in _KINDS:
             raise InputError(

@@ -7,12 +7,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 import msgspec
 import numpy as np
 from msgspec import Struct
 from scipy.stats import bootstrap, friedmanchisquare, rankdata, studentized_range
 
+from scanchain.comparison.methods import OURS
 from scanchain.comparison.processes import Status
 from scanchain.comparison.table import COLUMNS, Column, Row, Table, lined_up
 from scanchain.data import Matrix, Vector
@@ -89,17 +91,18 @@ class ComparedLog:
     @property
     def doubt(self) -> str:
         """Why the ground truth may be worse than the methods; empty where nothing says so."""
-        rows = [] if self.table is None else [row.figures for row in self.table.rows if row.status is Status.OK]
-        both = [(row["ate_m"], row["apart_m"]) for row in rows]
+        rows = [row for row in self.table.rows if row.status is Status.OK] if self.table is not None else []
+        ours = [row for row in rows if row.base in OURS]  # which resemble each other: one counts
+        both = [(row.figures["ate_m"], row.figures["apart_m"]) for row in rows if row not in ours[1:]]
         known = np.array([pair for pair in both if None not in pair])
         if len(known) < _FEWEST:
             return ""
-        ate_m, apart_m = np.median(known, axis=0).tolist()
+        ate_m, apart_m = float(known[:, 0].min()), float(np.median(known[:, 1]))
         if ate_m < _WORSE * apart_m:
             return ""
         return (
-            f"{self.name}: the methods are {ate_m:.2g} m from the ground truth, but {apart_m:.2g} m from each "
-            "other (medians), so it may be worse than they are"
+            f"{self.name}: all methods are {ate_m:.2g} m and more from the ground truth, but {apart_m:.2g} m from "
+            "each other (median), so it may be worse than they are"
         )
 
 
@@ -225,7 +228,8 @@ def _ranked(errors_m: Matrix) -> tuple[list[float], float | None, float | None]:
         return [], None, None
     ranks = rankdata(errors_m, axis=0).mean(axis=1).tolist()
     quantile = studentized_range.ppf(_LEVEL, count, math.inf) / math.sqrt(2.0)
-    p = float(friedmanchisquare(*errors_m).pvalue) if count > 2 else None
+    all_tie = not np.ptp(rankdata(errors_m, axis=0))
+    p = float(friedmanchisquare(*errors_m).pvalue) if count > 2 and not all_tie else None
     return ranks, float(quantile * math.sqrt(count * (count + 1) / (6.0 * logs))), p
 
 
@@ -259,7 +263,8 @@ def write_overall(folder: Path, overall: Overall) -> None:
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     for each in overall.standings:
         cells = [" ".join(filter(None, each.shown(column))) for column in FIGURES]
-        lines.append(f"| {' | '.join([each.name, each.share, *cells, each.shown_rank])} |")
+        name = each.name.replace("|", "\\|")
+        lines.append(f"| {' | '.join([name, each.share, *cells, each.shown_rank])} |")
     write_whole(folder / "overall.md", ("\n".join([*lines, "", *overall.notes]) + "\n").encode())
 
 
@@ -281,16 +286,18 @@ def overall_text(overall: Overall) -> str:
 
 def variation_folder(key: str, value: str) -> str:
     """Folder of the comparison with another value of a setting, within that of the comparison."""
-    return f"vary/{key}={value}"
+    return f"vary/{quote(key, safe='')}={quote(value, safe='')}"
 
 
 def sensitivity(varied: Mapping[str, Overall]) -> tuple[Column, list[str], Matrix]:
-    """Median accuracy by value of a setting (rows) and method (columns), NaN where a method did not finish.
+    """Median accuracy by value of a setting (rows) and method (columns), NaN where it failed on a log.
 
     The column is the ATE, over the path where all paths are long enough.
     """
     names = list(dict.fromkeys(each.name for overall in varied.values() for each in overall.standings))
-    by_value = [{each.name: each.figures for each in overall.standings} for overall in varied.values()]
+    by_value = [
+        {each.name: each.figures for each in overall.standings if not each.failed} for overall in varied.values()
+    ]
     ate, share = FIGURES[:2]
     known = [figures for of_methods in by_value for figures in of_methods.values() if ate.key in figures]
     column = share if all(share.key in figures for figures in known) else ate

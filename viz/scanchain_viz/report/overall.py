@@ -108,7 +108,7 @@ def _sensitivity(key: str, varied: Mapping[str, Overall]) -> Section:
         for value, row in zip(varied, accuracy.tolist(), strict=True)
     ]
     text = f"{column.heading} at each value, all else as above; medians over the logs. A value links to its page."
-    drawing = Drawing.of("Accuracy", "A gap where a method did not finish.", figure)
+    drawing = Drawing.of("Accuracy", "A gap where a method failed on a log.", figure)
     return Section(f"Sensitivity to {key}", text, chips, [drawing], Grid([Head(key), *map(Head, names)], rows))
 
 
@@ -173,7 +173,7 @@ def _pictures(overall: Overall, chips: list[Chip]) -> Iterator[Section]:
     known = [
         (each, chip, each.figures[_TIME].value, each.figures[_ACCURACY].value)
         for each, chip in zip(overall.standings, chips, strict=True)
-        if _TIME in each.figures and _ACCURACY in each.figures
+        if _TIME in each.figures and _ACCURACY in each.figures and not each.failed
     ]
     if known:
         figure = Plot("median time of a scan [ms]", "median ATE / path [%]", logarithmic="xy")
@@ -183,7 +183,10 @@ def _pictures(overall: Overall, chips: list[Chip]) -> Iterator[Section]:
         figure.line(_stairs(best, points.max(axis=0)), INK, THIN)
         for (_, chip, *_), point in zip(known, points, strict=True):
             figure.marks(point[None], "o", chip.color, _MARK)
-        caption = "Left and below is better. No method is both faster and more accurate than those on the line."
+        caption = (
+            "Left and below is better. No method is both faster and more accurate than those on the line. Without "
+            "those that failed on a log."
+        )
         drawings.append(Drawing.of("Accuracy against time", caption, figure))
     if overall.critical_difference is not None:
         drawings.append(_ranks(overall.standings, overall.critical_difference, chips))

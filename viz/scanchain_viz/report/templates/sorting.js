@@ -9,7 +9,8 @@ for (const table of document.querySelectorAll("table")) {
     const isNumeric = rows.some(([words]) => !isNaN(number(words))) && column > 0;
     rows.sort(([a], [b]) => {
       const [x, y] = isNumeric ? [number(a), number(b)] : [a, b];
-      if (isNumeric && (isNaN(x) || isNaN(y))) return isNaN(x) - isNaN(y);
+      const [noX, noY] = [x, y].map((value) => ["", "–"].includes(value) || Number.isNaN(value));
+      if (noX || noY) return noX - noY;
       return sign * (isNumeric ? x - y : x.localeCompare(y));
     });
     for (const head of heads) head.ariaSort = "none";
