@@ -57,7 +57,7 @@ class ScanchainPipeline(Pipeline):
 
     @staticmethod
     def url() -> str:
-        """Where it comes from: nowhere public yet."""
+        """The address of its project, which has none yet."""
         return ""
 
     @staticmethod

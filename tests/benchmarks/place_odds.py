@@ -88,7 +88,7 @@ def wrong(guest: SavedMap, host: SavedMap, found: list[bool]) -> Iterator[tuple[
         members, middle = guest.keyframes[first:end], guest.keyframes[(first + end) // 2]
         T_middle_odom = lie.inverse(middle.T_odom_lidar)
         points = np.vstack([lie.transform(T_middle_odom @ each.T_odom_lidar, each.points) for each in members])
-        best = completed(search.sought(points, LEAST))
+        best = completed(search.searched(points, LEAST))
         found.append(best is not None and best.is_certain and not best.is_ambiguous)
         if best is None:
             continue

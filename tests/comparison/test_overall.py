@@ -139,16 +139,16 @@ def test_a_truth_that_is_worse_than_the_methods_is_doubted():
     better = log(
         "rtk", *(row(name, ate, apart) for name, ate, apart in (("a", 0.1, 0.1), ("b", 0.2, 0.2), ("c", 0.1, 0.1)))
     )
-    assert worse.doubt == (
+    assert worse.warning == (
         "gps: all methods are 0.3 m and more from the ground truth, but 0.1 m from each other (median), so it may "
         "be worse than they are"
     )
     one_is_right = (("a", 0.01, 1.0), ("b", 1.0, 0.1), ("c", 1.05, 0.1), ("d", 0.98, 0.1))
-    assert not log("gps", *(row(*each) for each in one_is_right)).doubt
+    assert not log("gps", *(row(*each) for each in one_is_right)).warning
     alike = [row(name, 0.4, 0.001) for name in ("plicp", "svd", "plicp+loops")]  # no three independent methods
-    assert not log("gps", *alike).doubt and log("gps", *alike, row("a", 0.5, 0.1), row("b", 0.4, 0.1)).doubt
-    assert not better.doubt and not log("bare", row("a", None), row("b", None), row("c", None)).doubt
-    assert worse.doubt in overall_of([worse, better]).notes
+    assert not log("gps", *alike).warning and log("gps", *alike, row("a", 0.5, 0.1), row("b", 0.4, 0.1)).warning
+    assert not better.warning and not log("bare", row("a", None), row("b", None), row("c", None)).warning
+    assert worse.warning in overall_of([worse, better]).notes
 
 
 def test_the_tables_have_a_row_for_each_method_and_name_what_failed(tmp_path):

@@ -47,7 +47,7 @@ def seen(with_pillar):
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_free_space_tells_rooms_apart_that_have_the_same_walls(which):
-    best = completed(rooms([True, False]).sought(seen(with_pillar=which == 0)))
+    best = completed(rooms([True, False]).searched(seen(with_pillar=which == 0)))
     off_m, off_rad = lie.apart(CENTERS[which] @ T_ROOM_LIDAR, best.T_map_lidar)
     assert off_m < 0.1 and off_rad < 0.03
     assert best.share > 0.9
@@ -55,7 +55,7 @@ def test_free_space_tells_rooms_apart_that_have_the_same_walls(which):
 
 
 def test_two_identical_rooms_rival_each_other():
-    best = completed(rooms([True, True]).sought(seen(with_pillar=True)))
+    best = completed(rooms([True, True]).searched(seen(with_pillar=True)))
     assert best.rival > 0.95 * best.share
 
 
@@ -65,8 +65,8 @@ def test_a_search_in_slices_finds_what_one_at_once_does(monkeypatch):
     for additions, steps in ((10**12, 10**9), (2_000_000, 100)):
         monkeypatch.setattr(search, "_ADDITIONS", additions)
         monkeypatch.setattr(search, "_STEPS", steps)
-        slices.append(sum(1 for _ in target.sought(points)) + 1)
-        found.append(completed(target.sought(points)))
+        slices.append(sum(1 for _ in target.searched(points)) + 1)
+        found.append(completed(target.searched(points)))
     assert slices[0] == 2 and slices[1] > 3
     one, other = found
     assert (one.T_map_lidar == other.T_map_lidar).all()
@@ -75,7 +75,7 @@ def test_a_search_in_slices_finds_what_one_at_once_does(monkeypatch):
 
 def test_a_room_of_another_shape_is_nowhere():
     circle = np.stack([np.cos(a := np.linspace(-np.pi, np.pi, 720)), np.sin(a)], axis=1)
-    assert completed(rooms([True, False]).sought(1.7 * circle)) is None
+    assert completed(rooms([True, False]).searched(1.7 * circle)) is None
 
 
 def test_a_place_that_looked_like_another_is_believed_after_more_of_the_path_alone():

@@ -196,7 +196,7 @@ def on_cluster(
             raise InputError(f"--ray is {address!r}: {reason}; start a cluster with ray start --head") from None
 
     def work(tasks: Sequence[T]) -> Iterator[R]:
-        connect()  # anew after an earlier call
+        connect()  # again after an earlier call
         nodes = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
         cores = max(nodes, default=1.0) if has_whole_node else 1.0
         remote = ray.remote(num_cpus=cores, max_retries=_NODE_LOSSES)(attempt)

@@ -131,13 +131,13 @@ def vary_each(
     overall : of all logs with the usual values
     compared : ``compare_each`` of a directory and a ``variation``
     """
-    found: dict[str, dict[str, Overall]] = {key: {} for key in variations}
+    found: dict[str, dict[str, Overall]] = {}
     for key, value in [(key, value) for key, values in variations.items() for value in values]:
         if any(log.reason == _STOPPED for log in overall.logs):
             break
         overall = compared(out / variation_folder(key, value), variation=Variation(key, value))
-        found[key][value] = overall
-    return {key: by_value for key, by_value in found.items() if by_value}
+        found.setdefault(key, {})[value] = overall
+    return found
 
 
 def _task(files: tuple[Source, ...], out: Path, present: Callable[[Path], None], given: dict[str, Any]) -> Task:
@@ -162,12 +162,13 @@ def _task(files: tuple[Source, ...], out: Path, present: Callable[[Path], None],
 def _topic_of(files: Sequence[Source], given: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
     """The overrides without a lidar topic that the log does not have: another log of the comparison has it."""
     overrides: Sequence[Override] = given.get("overrides", ())
-    wanted = named(overrides, "log.topic")
+    if not (wanted := named(overrides, "log.topic")):
+        return {}
     try:
-        known = topics_of(index_files(files)) if wanted else {}
+        known = topics_of(index_files(files))
     except InputError:  # comparing says why
         return {}
-    if not wanted or any(topic.strip() in known for topic in wanted.split(",")):
+    if any(topic.strip() in known for topic in wanted.split(",")):
         return {}
     progress.announce(f"{files[0]}: has no topic {wanted}; its own lidar is used")
     return {"overrides": tuple(each for each in overrides if each.key != "log.topic")}

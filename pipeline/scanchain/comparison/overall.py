@@ -89,7 +89,7 @@ class ComparedLog:
     reason: str = ""
 
     @property
-    def doubt(self) -> str:
+    def warning(self) -> str:
         """Why the ground truth may be worse than the methods; empty where nothing says so."""
         rows = [row for row in self.table.rows if row.status is Status.OK] if self.table is not None else []
         ours = [row for row in rows if row.base in OURS]  # which resemble each other: one counts
@@ -142,8 +142,8 @@ class Overall:
 
     @property
     def notes(self) -> list[str]:
-        """What the figures are, ranks, doubts and failures, one per line."""
-        return [*filter(None, (_MEANING, self.ranking, *(log.doubt for log in self.logs))), *self.failures]
+        """Meaning of the figures, ranks, warnings and failures, one per line."""
+        return [*filter(None, (_MEANING, self.ranking, *(log.warning for log in self.logs))), *self.failures]
 
     @property
     def failures(self) -> list[str]:
@@ -226,17 +226,16 @@ def _ranked(errors_m: Matrix) -> tuple[list[float], float | None, float | None]:
     count, logs = errors_m.shape
     if count < 2 or logs < 2:
         return [], None, None
-    ranks = rankdata(errors_m, axis=0).mean(axis=1).tolist()
+    ranks = rankdata(errors_m, axis=0)
     quantile = studentized_range.ppf(_LEVEL, count, math.inf) / math.sqrt(2.0)
-    all_tie = not np.ptp(rankdata(errors_m, axis=0))
-    p = float(friedmanchisquare(*errors_m).pvalue) if count > 2 and not all_tie else None
-    return ranks, float(quantile * math.sqrt(count * (count + 1) / (6.0 * logs))), p
+    p = float(friedmanchisquare(*errors_m).pvalue) if count > 2 and np.ptp(ranks) else None
+    return ranks.mean(axis=1).tolist(), float(quantile * math.sqrt(count * (count + 1) / (6.0 * logs))), p
 
 
 def write_overall(folder: Path, overall: Overall) -> None:
     """overall.json, overall.csv, overall.md."""
     logs = [
-        {"name": each.name, "folder": each.folder, "reason": each.reason, "doubt": each.doubt}
+        {"name": each.name, "folder": each.folder, "reason": each.reason, "warning": each.warning}
         for each in overall.logs
     ]
     tree = {
@@ -269,7 +268,7 @@ def write_overall(folder: Path, overall: Overall) -> None:
 
 
 def overall_text(overall: Overall) -> str:
-    """Medians for a terminal, then ranks, failures and doubts."""
+    """Medians for a terminal, then ranks, warnings and failures."""
     standings = overall.standings
     columns = [
         ["method", "", *(each.name for each in standings)],

@@ -14,6 +14,7 @@ from scanchain.comparison.methods import POSES, SCANS
 from scanchain.comparison.processes import StoredScans
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError, counted
+from scanchain.evaluation.pairing import nearest
 from scanchain.maps import write_ply
 from scanchain.processes import MOST_CHARACTERS
 from scanchain.trajectory import read_tum
@@ -53,16 +54,12 @@ def run_program(command: str, scans: StoredScans, folder: Path) -> tuple[Matrix,
 
 def _of_scans(trajectory: Trajectory, scans: StoredScans) -> Matrix:
     """A pose for each scan, by its stamp, or by its order where there are as many of other stamps."""
-    order = np.argsort(trajectory.stamps_ns, kind="stable")
-    stamps_ns, poses = trajectory.stamps_ns[order], trajectory.poses[order]
-    after = np.clip(np.searchsorted(stamps_ns, scans.stamps_ns), 1, max(len(stamps_ns) - 1, 1))
-    choices = np.minimum(np.stack([after - 1, after]), len(stamps_ns) - 1)
-    away_ns = np.abs(stamps_ns[choices] - scans.stamps_ns)
-    nearest = np.where(away_ns[0] <= away_ns[1], *choices)
-    if (away_ns.min(axis=0) <= _WITHIN_NS).all():
-        return poses[nearest]
+    poses = trajectory.poses
+    rows, away_ns = nearest(scans.stamps_ns, trajectory.stamps_ns)
+    if (away_ns <= _WITHIN_NS).all():
+        return poses[rows]
     if len(poses) == len(scans):
-        return trajectory.poses
+        return poses
     raise InputError(
         f"it wrote {counted(len(poses), 'pose')} for {counted(len(scans), 'scan')}; each needs one, of its stamp"
     )

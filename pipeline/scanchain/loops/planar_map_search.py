@@ -103,7 +103,7 @@ class PlanarMapSearch:
         room = (cells == Score.FREE) | (cells == Score.NEAR)
         self.grid = SearchGrid(cells, grid.origin_m - self.resolution_m, self.resolution_m, room)
 
-    def sought(self, points: Points, least: float = _IN_MAP.least) -> Generator[None, None, Hypothesis | None]:
+    def searched(self, points: Points, least: float = _IN_MAP.least) -> Generator[None, None, Hypothesis | None]:
         """The pose that the points (N, 2), lidar frame, fit best; None if none has the least share.
 
         Poses are searched with some of the points, in slices of equal work; those found are compared with more.
@@ -121,7 +121,7 @@ class PlanarMapSearch:
     def likely(self, path: Sequence[Keyframe]) -> Hypothesis | None:
         """The pose of the middle keyframe of a path that its points fit best; None if they fit none."""
         T_middle_odom = lie.inverse(path[len(path) // 2].T_odom_lidar)
-        best = completed(self.sought(seen_together(path, T_middle_odom)))
+        best = completed(self.searched(seen_together(path, T_middle_odom)))
         return best if best is not None and best.is_likely else None
 
 
@@ -148,7 +148,7 @@ class PlanarFinder:
         """Closures of keyframes of the path with older ones; see ``Finder``."""
         path = keyframes[_path_begin(keyframes, start) :]
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
-        best = yield from target.sought(seen_together(path, T_newest_odom))
+        best = yield from target.searched(seen_together(path, T_newest_odom))
         newest_m = path[-1].traveled_m
         self.searches += 1
         if best is not None and best.is_likely and best.is_ambiguous:

@@ -41,11 +41,12 @@ def draw_growing_map(directory: Path, picture: Path) -> None:
         """Columns and rows (N, 2) of positions."""
         return np.stack([scale * (points[:, 0] - low[0]), scale * (high[1] - points[:, 1])], axis=1)
 
-    is_planar = saved.dimension == 2
-    shades = np.ones(sum(map(len, clouds)), np.uint8)
+    points, of_keyframe = np.vstack(clouds), np.repeat(np.arange(len(clouds)), list(map(len, clouds)))
+    column, row = pixels(points).astype(int).T
+    seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    is_planar, shades = saved.dimension == 2, np.ones(len(points), np.uint8)
     if not is_planar:
-        shades += np.rint((_HEIGHTS - 1) * height_shares(np.vstack(clouds)[:, 2])).astype(np.uint8)
-    bounds = np.cumsum([0, *map(len, clouds)])
+        shades += np.rint((_HEIGHTS - 1) * height_shares(points[:, 2])).astype(np.uint8)
     colors = [rgb(_POINTS)] if is_planar else palette_of(_SHADES, _HEIGHTS)[:, :3].tolist()
     palette = [rgb(_BACKGROUND), *colors, rgb(_PATH), rgb(_HEAD)]
     path, head = len(palette) - 2, len(palette) - 1
@@ -54,10 +55,8 @@ def draw_growing_map(directory: Path, picture: Path) -> None:
     def frames(count: int) -> list[Image.Image]:
         canvas, drawn, found = np.zeros((height, width), np.uint8), 0, []
         for last in np.unique(np.linspace(1, len(clouds), count).astype(int)).tolist():
-            for k in range(drawn, last):
-                column, row = pixels(clouds[k]).astype(int).T
-                seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-                np.maximum.at(canvas, (row[seen], column[seen]), shades[bounds[k] : bounds[k + 1]][seen])
+            new = seen & (of_keyframe >= drawn) & (of_keyframe < last)
+            np.maximum.at(canvas, (row[new], column[new]), shades[new])
             drawn = last
             image = Image.fromarray(canvas)
             image.putpalette(np.array(palette, np.uint8).tobytes())

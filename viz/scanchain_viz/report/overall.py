@@ -42,7 +42,7 @@ def write_overall_report(
             ("scans", f"{scans:,}"),
             ("methods", f"{len(overall.standings)}"),
         ),
-        warnings=[*overall.failures, *filter(None, (log.doubt for log in overall.logs))],
+        warnings=[*overall.failures, *filter(None, (log.warning for log in overall.logs))],
         sections=[*_sections(overall), *starmap(_sensitivity, (varied or {}).items())],
         links=[(name, name) for name in ("overall.csv", "overall.md", "overall.json")],
         is_sortable=True,
