@@ -242,7 +242,7 @@ def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkey
         span = {"log__start_s": k * quarter_s, "log__end_s": (k + 1) * quarter_s}
         made.run("office", tmp_path, seed=2, **span).rename(part)
     work = {}
-    for owner, name in ((PlanarMapSearch, "sought"), (Verifier, "scan"), (PoseGraph, "optimize")):
+    for owner, name in ((PlanarMapSearch, "searched"), (Verifier, "scan"), (PoseGraph, "optimize")):
         act = getattr(owner, name)
         work[owner] = create_autospec(act, side_effect=act)
         monkeypatch.setattr(owner, name, work[owner])
