@@ -157,7 +157,9 @@ def test_a_range_and_a_heading_of_ones_own_move_the_poses_and_are_refused_by_the
     assert np.allclose(graph.poses[[3, 7]], true[[3, 7]], atol=2e-3)
     assert not np.allclose(graph.poses[5], true[5], atol=2e-3)
     found = graph.certify()
-    assert not found.certified and "no bound for 6 edges of heading and range to a beacon" in found.verdict
+    assert not found.certified and found.verdict.endswith(
+        "; bounded by zero: 6 edges of heading and range to a beacon"
+    )
     with pytest.warns(UserWarning, match="no tag for 6 edges of custom factors"):
         write_g2o(tmp_path / "x.g2o", graph)
     assert len(read_g2o(tmp_path / "x.g2o").graph.edges) == 7
@@ -313,10 +315,7 @@ def test_the_origin_is_no_pose_in_messages():
     graph.add_factor(Prior(), 2, np.eye(3), true[2] @ lie.pose_2d(0.0, 0.0, 2.5))
     graph.add_factor(Prior(), 0, np.eye(3), true[0])
     graph.optimize(GraphConfig())
-    assert graph.certify().reason.endswith("first the prior of 2")
-    graph.fix(0)
-    graph.optimize(GraphConfig())
-    assert graph.certify().reason == "the origin and 1 pose are fixed; the bound is for one"
+    assert "the origin" not in graph.certify().verdict
 
 
 @pytest.mark.parametrize("robust", ["truncated", "huber", "geman-mcclure"])

@@ -1,6 +1,7 @@
 """Pose graphs for tests: published ones, of given poses and edges, and rings."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanchain import lie
 from scanchain.config import GraphConfig
@@ -98,3 +99,92 @@ def with_false_loops(name, share, seed=0):
     real = len(graph.edges)
     graph.add_edges(pairs, lie.exp(twists), np.tile(omega, (len(pairs), 1, 1)), np.ones(len(pairs), bool))
     return graph, true, np.arange(len(graph.edges)) >= real
+
+
+def garage(*, count=1661, sigma=(0.02, 0.005), kappa=1.0, seed=0):
+    """Laps up and down five floors, a pose every 4 m, with loops between neighboring passes and floors.
+
+    sigma : of the noise, m and rad; the information is 1 m⁻² and κ rad⁻² whatever the noise, as in published ones
+    """
+    rng = np.random.default_rng(seed)
+    along, lap, floors = 4.0 * np.arange(count), 170.0, 5
+    cosine, sine = (each(2.0 * np.pi * along / lap) for each in (np.cos, np.sin))
+    level = 3.0 * floors * np.abs((along / (floors * lap)) % 2.0 - 1.0)
+    oval = (40.0 * np.sign(cosine) * np.abs(cosine) ** 0.6, 22.0 * np.sign(sine) * np.abs(sine) ** 0.6)
+    positions = np.stack([oval[0] + 0.3 * rng.normal(size=count), oval[1], level], axis=1)
+    ahead = np.gradient(positions, axis=0)
+    true = lie.exp(np.stack([*np.zeros((5, count)), np.arctan2(ahead[:, 1], ahead[:, 0])], axis=1))
+    true[:, :3, 3] = positions
+    return _surveyed(true, 6.0, 3 * count, np.repeat(sigma, 3), np.diag([1.0] * 3 + [kappa] * 3), rng)
+
+
+def streets(*, count=15000, sigma=(0.01, 0.01), anisotropy=1.0, seed=0):
+    """A long walk through a grid of streets with few loops: 100 m⁻² (times the anisotropy ahead), 180 rad⁻²."""
+    rng = np.random.default_rng(seed)
+    heading, toward, left, position, poses = 0.0, 0.0, 0.0, np.zeros(2), []
+    for _ in range(count):
+        if left <= 0.0:
+            toward, left = toward + 0.5 * np.pi * rng.choice([-1, 0, 1]), rng.choice([60.0, 120.0])
+        heading += np.clip(toward - heading, -0.3, 0.3) + 0.01 * rng.normal()
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        position, left = position + 0.45 * ahead, left - 0.45
+        poses.append([*position, heading])
+        if (np.abs(position) > 250.0).any() and position @ ahead > 0.0 and left < 60.0:
+            toward, left = toward + np.pi, 60.0
+    planar = np.array(poses)
+    true = lie.exp(planar * [0.0, 0.0, 1.0])
+    true[:, :2, 2] = planar[:, :2]
+    omega = np.diag([100.0 * anisotropy, 100.0, 180.0])
+    return _surveyed(true, 4.0, count // 9, np.repeat(sigma, (2, 1)), omega, rng)
+
+
+def _surveyed(true, reach, loops, sigma, information, rng):
+    """A graph of odometry and of some of the pairs within reach, which starts from the odometry."""
+    pairs = cKDTree(true[:, :-1, -1]).query_pairs(reach, output_type="ndarray")
+    pairs = pairs[np.abs(pairs[:, 1] - pairs[:, 0]) > 8]
+    pairs = pairs[rng.permutation(len(pairs))[:loops]]
+    places = np.arange(len(true))
+    edges = np.concatenate([np.stack([places[:-1], places[1:]], axis=1), pairs])
+    i, j = edges.T
+    measured = lie.inverse(true[i]) @ true[j] @ lie.exp(sigma * rng.normal(size=(len(edges), len(sigma))))
+    poses = [true[0]]
+    for step in measured[: len(true) - 1]:
+        poses.append(poses[-1] @ step)
+    return graph_of(poses, edges, measured, information)
+
+
+def tangled(dimension, seed):
+    """A small random graph with noise up to where it has several minima, anisotropic and with long edges."""
+    rng = np.random.default_rng(seed)
+    k, count = (3, 6)[dimension - 2], int(rng.integers(4, 10))
+    poses = lie.exp(rng.normal(size=(count, k)))
+    poses[:, :dimension, dimension] *= rng.choice([0.3, 1.0, 10.0])
+    edges = {(i, i + 1) for i in range(count - 1)}
+    edges |= {
+        tuple(sorted(rng.choice(count, 2, replace=False).tolist())) for _ in range(rng.integers(1, 2 * count))
+    }
+    edges = np.array(sorted(edges))
+    sigma = np.repeat(rng.choice([0.03, 0.3, 1.0, 2.0], 2), (dimension, k - dimension))
+    sigma = sigma * rng.choice([1.0, 1.0, 0.1, 0.03], size=(len(edges), k))
+    noise = rng.choice([0.3, 1.0, 3.0]) * sigma * rng.normal(size=(len(edges), k))
+    mix = np.eye(k) + rng.choice([0.0, 0.5]) * rng.normal(size=(len(edges), k, k))
+    information = np.swapaxes(mix, 1, 2) @ (mix * sigma[:, :, None] ** -2)
+    measured = lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ lie.exp(noise)
+    graph = graph_of(poses, edges, measured, information)
+    if rng.random() < 0.2:
+        graph.fix(0)
+        graph.fix(count - 1)
+    return graph
+
+
+def restarted(graph, rng, size):
+    """A copy whose free poses start off by twists of this size."""
+    twists = size * rng.normal(size=(len(graph), graph.freedom))
+    twists[graph.fixed] = 0.0
+    copy = PoseGraph(graph.dimension)
+    for pose in lie.exp(twists) @ graph.poses:
+        copy.add_pose(pose, len(copy))
+    copy.add_edges(graph.edges, graph.measurements, graph.information, graph.is_loop)
+    for index in np.flatnonzero(graph.fixed).tolist():
+        copy.fix(index)
+    return copy

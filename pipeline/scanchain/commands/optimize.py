@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -122,9 +122,9 @@ def optimize(
     file = _read(source, cast("Indefinite", indefinite), cast("Noise", noise), is_robust)
     graph, ids, before = file.graph, file.ids, file.graph.state()
     chosen = None if marginals is None else chosen_poses(marginals, ids)
-    done = graph.optimize(config, initialize=cast("Initialization", initialize))
+    done, certificate = graph.optimize_globally(config, initialize=cast("Initialization", initialize))
     change = GraphChange(source.name, before, done.state)
-    report = _Report(file, change, done, graph.free_poses(), graph.weakly_joined(), graph.certify())
+    report = _Report(file, change, done, graph.free_poses(), graph.weakly_joined(), certificate)
     written = _write(file, change, chosen, out, png, recording)
     lines = [*report.lines(), *(("written", path) for path in written)]
     text = "\n".join(f"{name:<15}{fact}" for name, fact in lines)
@@ -203,6 +203,8 @@ class _Report:
 
         file, graph, done = self.file, self.file.graph, self.optimization
         guess = done.initialization
+        if guess == "relaxation":
+            guess = "the minimum of the semidefinite relaxation, lower than from the first guess"
         if guess == "given":
             guess = "the file's poses" if file.has_guess else "odometry, as the file has no vertices"
         size = f"{graph.dimension}D, {counted(len(graph), 'pose')}, {counted(len(graph.edges), 'edge')}"
@@ -296,5 +298,6 @@ class _Report:
             "time_s": done.time_s,
             "free": self.free.tolist(),
             "weakly_joined": self.weak.tolist(),
-            "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
+            "certificate": asdict(replace(self.certificate, relaxed=None))
+            | {"relative_gap": self.certificate.relative_gap, "lower_bound": self.certificate.lower_bound},
         }

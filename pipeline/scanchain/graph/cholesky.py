@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spilu
 
-from scanchain.data import Integers, Matrix, Vector
+from scanchain.data import Integers, Mask, Matrix, Vector
 from scanchain.kernels.graph import cholesky, symbolic
 
 
@@ -40,16 +40,26 @@ class BlockPattern:
         squares, within = np.cumsum(sizes**2) - sizes**2, np.arange(self.scalars) - np.repeat(self.starts, sizes)
         self.diagonal = np.repeat(squares, sizes) + within * (np.repeat(sizes, sizes) + 1)  # (scalars,) of values
 
-    def multiply(self, values: Vector, x: Vector) -> Vector:
-        """The product of the symmetric matrix of these values with a vector (scalars,)."""
+    def entries(self) -> tuple[Integers, Integers, Mask]:
+        """Row and column of every value, and whether it stands for its transpose as well, (value_count,) each."""
         counts = self.sizes[self.rows] * self.sizes[self.columns]
         block, within = np.repeat(np.arange(len(counts)), counts), symbolic.ranges(np.zeros_like(counts), counts)
-        row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
         in_row, in_column = np.divmod(within, self.sizes[self.columns][block])
-        row, column, is_pair = row + in_row, column + in_column, row != column
+        row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
+        return row + in_row, column + in_column, (self.rows != self.columns)[block]
+
+    def multiply(self, values: Vector, x: Vector) -> Vector:
+        """The product of the symmetric matrix of these values with a vector (scalars,)."""
+        row, column, is_pair = self.entries()
         result = np.bincount(row, values * x[column], self.scalars)
         result += np.bincount(column[is_pair], (values * x[row])[is_pair], self.scalars)
         return result.astype(np.float64, copy=False)
+
+    def matrix(self, values: Vector) -> csr_matrix:
+        """The symmetric matrix of these values, (scalars, scalars)."""
+        row, column, is_pair = self.entries()
+        ends = np.append(row, column[is_pair]), np.append(column, row[is_pair])
+        return csr_matrix((np.append(values, values[is_pair]), ends), shape=(self.scalars, self.scalars))
 
 
 class Packing:
@@ -80,10 +90,16 @@ class Packing:
 
     def packed(self, vectors: Matrix) -> Matrix:
         """Packed vectors (scalars, ...) of vectors (n, k, ...)."""
-        return vectors[self._kept_rows]
+        return (
+            vectors.reshape(self._kept_rows.size, *vectors.shape[2:])
+            if self._is_whole
+            else vectors[self._kept_rows]
+        )
 
     def unpacked(self, packed: Matrix) -> Matrix:
         """Vectors (n, k, ...) of packed vectors (scalars, ...), zero where none is stored."""
+        if self._is_whole:
+            return packed.reshape(*self._kept_rows.shape, *packed.shape[1:])
         result = np.zeros((*self._kept_rows.shape, *packed.shape[1:]))
         result[self._kept_rows] = packed
         return result

@@ -78,7 +78,7 @@ class Optimization:
     iterations: int
     converged: bool
     reason: str
-    initialization: Initialization
+    initialization: Initialization | Literal["relaxation"]
     time_s: float
 
     @property

@@ -44,6 +44,8 @@ from scanchain.graph.optimization import Optimization, Rejection, Since
 from scanchain.graph.problem import GraphProblem
 from scanchain.growing_array import GrowingArray
 
+_LOWER = 1e-6  # share of the cost by which a minimum is lower than another one
+
 
 class PoseGraph:
     """Poses T_world_lidar and between factors T_ij (frame j seen from frame i) with e = log(T_ij⁻¹ T_i⁻¹ T_j).
@@ -355,6 +357,25 @@ class PoseGraph:
             time_s=working_s() - begin,
         )
 
+    def optimize_globally(
+        self, config: GraphConfig, *, initialize: Initialization = "auto"
+    ) -> tuple[Optimization, Certificate]:
+        """Optimize and certify; while not certified, again from the minimum of the relaxation if that is lower."""
+        done = self.optimize(config, initialize=initialize)
+        while (certificate := self.certify()).relaxed is not None and not certificate.certified:
+            other = self.copy()
+            other._poses.replace(certificate.relaxed[: len(self)])
+            again = other.optimize(config, initialize="given")
+            if not again.cost_after < (1.0 - _LOWER) * done.cost_after:
+                break
+            self.adopt(other)
+            spent_s, iterations = done.time_s + again.time_s, done.iterations + again.iterations
+            done = replace(
+                again, chi2_before=done.chi2_before, initialization="relaxation", iterations=iterations,
+                time_s=spent_s,
+            )  # fmt: skip
+        return done, certificate
+
     def optimize_end(self, config: GraphConfig, first: int, rejection: Rejection) -> None:
         """Optimize this pose and all later ones, with all others fixed.
 
@@ -425,7 +446,7 @@ class PoseGraph:
     def certify(self) -> Certificate:
         """Certificate of the global minimum of χ², with the edge weights of the last optimization."""
         graph = self._prepared(), self._vertices, self._weight_in_force
-        return replace(certify(*graph, self._undetermined(), self.names), left_out=self.left_out)
+        return replace(certify(*graph, self._undetermined()), left_out=self.left_out)
 
     def free_poses(self) -> Integers:
         """Names of the poses that the edges in force leave free in some direction, at the current poses."""
