@@ -346,6 +346,13 @@ def test_stamps_and_log_times_of_which_one_is_in_another_unit_are_named(tmp_path
     assert max(spans_s, default=0.0) <= 10.0 * period_s  # else deskewing turns each scan by revolutions
 
 
+def test_scans_that_are_logged_in_bursts_have_no_gaps_and_those_without_stamps_have(tmp_path):
+    late = drive(log=lambda k: (4 - k % 5) * STEP_NS)
+    assert diagnose(saved(tmp_path, late))["gaps"].severity == "ok"
+    unstamped = drive(log=lambda k: 20 * STEP_NS * (k > 20), stamp=lambda k: -k * STEP_NS)
+    assert "1 longer than 2.5 periods" in diagnose(saved(tmp_path, unstamped))["gaps"].found
+
+
 @pytest.mark.parametrize(
     ("ppm", "jitter_ms", "is_noted"), [(1000, 0, True), (-300, 1, True), (10, 0, False), (1000, 15, False)]
 )

@@ -186,7 +186,8 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
 
 
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
-    steps_s = np.diff(seen.log_times_ns) * 1e-9
+    logged_ns, stamps_ns = np.diff([seen.log_times_ns, seen.stamps_ns])  # scans logged in bursts have no gaps
+    steps_s = 1e-9 * (np.minimum(logged_ns, stamps_ns) if stamps_ns.any() else logged_ns)
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
     periods = f"{_GAP_PERIODS:g} periods" + (f" of {seen.period_s:.3g} s" if seen.period_s else "")
     if not len(gaps):
