@@ -66,7 +66,7 @@ def page(name):
 def rows(name, heading):
     """Cells of each row of the tables under a heading of a page."""
     section = (
-        (ROOT / "docs" / name).read_text(encoding="utf-8").partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+        (ROOT / "docs" / name).read_text(encoding="utf-8").partition(f"\n## {heading}\n")[2].partition("\n#")[0]
     )
     lines = [line for line in section.splitlines() if line.startswith("|")]
     assert lines, f"{name} has no table under {heading}"
