@@ -57,7 +57,7 @@ count:
 	  END { for (room in lines) printf "%7d lines %4d files  %s\n", lines[room], files[room], room }' | sort -k5
 	@cat README.md CHANGELOG.md CONTRIBUTING.md docs/*.md | wc -c | awk '{ printf "%7.1f kB of documentation\n", $$1 / 1000 }'
 
-docs: $(DOCS)
+docs: $(BASELINES) $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
 	@! grep -rnE '<(script|link rel="stylesheet")[^>]*(src|href)="https?:' build/docs --include '*.html'  # works offline
 	@echo "Open build/docs/index.html"

@@ -60,7 +60,7 @@ def test_a_log_has_a_length_and_scans_and_slam_gives_the_cloud_and_the_verdict_o
     assert len(sc.cloud(result)) == done.metrics.map_points
     assert done.accuracy.ate_rmse_m == done.metrics.ground_truth.optimized.ate_rmse_m
     shown = done._repr_html_()  # in a notebook
-    assert done.summary.splitlines()[0] in unescape(shown) and "<svg" in shown and "60 poses" in shown
+    assert done.summary.splitlines()[0] in unescape(shown) and "<svg" in shown and "60 poses of SE(2)" in shown
     untrue = sc.run(office, tmp_path / "untrue", recording=False, log__ground_truth_topic="none")
     with pytest.raises(InputError, match="no ground truth; name a file by ground_truth"):
         untrue.accuracy  # noqa: B018

@@ -12,7 +12,7 @@ their halves, and every second and third of their scans. A line says
             distribution of right ones: 1 is exact, more is overconfident; from scans that are neither degenerate
             nor lost
   k         of smfeval, if it is installed: median of the squared error of keyframes after alignment over their
-            covariances (keyframes.tum), over that of right ones
+            covariances (keyframes.tum), over that of right ones, of as many directions as the log has
   k pair    of smfeval's pair, which needs no truth: keyframes against KISS-ICP's, in space, which states no
             covariances and is given these: above 1 the two contradict each other by more than both would claim
 
@@ -143,8 +143,8 @@ def judged(
     if expected is None:
         return Line(name, true_m, *[np.nan] * 6)
     ate = expected.ate
-    nees, gap = _nees(result, steps, truth), _gap(result, expected, truth)
-    return Line(name, true_m, ate.mean, ate.low, ate.high, nees, gap, _pair_gap(result, expected, steps))
+    nees, gap = _nees(result, steps, truth), smfeval_gap(result, expected, truth)
+    return Line(name, true_m, ate.mean, ate.low, ate.high, nees, gap, pair_gap(result, expected, steps))
 
 
 def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float:
@@ -161,8 +161,10 @@ def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float
     return float(np.nanmedian(nees) / (chi2.median(k) / k))
 
 
-def _gap(result: SlamResult, expected: evaluation.ExpectedErrors, truth: Trajectory) -> float:
-    """The scale gap k of smfeval; NaN where it is not installed."""
+def smfeval_gap(
+    result: SlamResult, expected: evaluation.ExpectedErrors, truth: Trajectory, sync: str = "nearest"
+) -> float:
+    """The scale gap k of smfeval, which assumes three directions, for the log's; NaN if it is not installed."""
     try:
         from smfeval.cli.main import main
     except ImportError:
@@ -171,16 +173,17 @@ def _gap(result: SlamResult, expected: evaluation.ExpectedErrors, truth: Traject
         estimate, reference = Path(folder, "keyframes.tum"), Path(folder, "truth.tum")
         write_wide_tum(estimate, result.keyframe_trajectory, expected.covariances)
         write_tum(reference, truth, force=True)
-        frames = ("--est-body-frame", "lidar", "--ref-body-frame", "lidar", "--t_max_diff", "0.02")
+        frames = ("--est-body-frame", "lidar", "--ref-body-frame", "lidar", "--t_max_diff", "0.02", "--sync", sync)
         said = io.StringIO()
         quiet = contextlib.redirect_stderr(io.StringIO())
         with contextlib.redirect_stdout(said), quiet, contextlib.suppress(SystemExit):
             main(["nees", str(estimate), str(reference), *frames])
     found = re.findall(r"\bk = ([0-9.e+-]+)", said.getvalue())
-    return float(found[0]) if found else np.nan
+    of_dimension = chi2.median(3) / chi2.median(result.trajectory.dimension)
+    return float(found[0]) * of_dimension if found else np.nan
 
 
-def _pair_gap(result: SlamResult, expected: evaluation.ExpectedErrors, steps: Sequence[Step]) -> float:
+def pair_gap(result: SlamResult, expected: evaluation.ExpectedErrors, steps: Sequence[Step]) -> float:
     """The scale gap k of smfeval's pair with KISS-ICP in space; NaN where smfeval or KISS-ICP is not installed."""
     try:
         from smfeval.io.load import load_tum_gaussian

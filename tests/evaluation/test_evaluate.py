@@ -239,6 +239,32 @@ def test_truth_at_another_rate_is_interpolated_as_naive_does(is_planar):
     assert min(pairs.early, pairs.late, pairs.in_gap, pairs.interpolated) > 0
 
 
+@pytest.mark.parametrize("bag", ["", "2d/mocap_room_1.bag"])
+def test_interpolated_truth_and_ate_equal_those_of_evo(bag):
+    """Of a made-up drive, and at the stamps of real scans by a motion capture, which has gaps of half a second."""
+    core = [pytest.importorskip(f"evo.core.{name}") for name in ("trajectory", "sync", "metrics")]
+    PoseTrajectory3D, sync, metrics = core[0].PoseTrajectory3D, core[1], core[2]
+    truth, stamps_ns = drive(400), drive().stamps_ns[:80] * 2 - drive().stamps_ns[0] + 37_000_000
+    if bag:
+        log = open_log(shared_data(bag), ground_truth_topic="/vrpn_client_node/jackal/pose")
+        truth, stamps_ns = log.ground_truth(), np.array([scan.stamp_ns for scan in log.scans()])
+        truth = Trajectory(truth.stamps_ns, lie.lift(truth.poses))
+    stamps_ns = stamps_ns[(stamps_ns > truth.stamps_ns.min()) & (stamps_ns < truth.stamps_ns.max())]
+    estimate = disturbed(Trajectory(stamps_ns, drive(len(stamps_ns), step_m=0.02).poses))
+    ours = ev.pair(estimate, truth, gap_s=10.0)
+    both = [
+        PoseTrajectory3D(poses_se3=list(each.poses), timestamps=1e-9 * (each.stamps_ns - truth.stamps_ns.min()))
+        for each in (truth, estimate)
+    ]
+    reference, found = sync.associate_trajectories(*both, max_diff=10.0, sync_method=sync.SyncMethod.interpolation)
+    assert len(ours) == len(found.timestamps) == len(stamps_ns) and 2 * ours.interpolated > len(ours)
+    np.testing.assert_allclose(ours.reference, reference.poses_se3, atol=2e-6)  # stamps of evo are floats
+    found.align(reference)
+    ate = metrics.APE(metrics.PoseRelation.translation_part)
+    ate.process_data((reference, found))
+    assert ev.absolute_error(ours).translation_m.rmse == pytest.approx(ate.get_all_statistics()["rmse"], abs=1e-6)
+
+
 def test_a_true_pose_of_the_same_stamp_is_taken_to_the_last_bit_in_any_order():
     truth = drive(50)
     order = np.random.default_rng(0).permutation(50)

@@ -346,6 +346,43 @@ def test_stamps_and_log_times_of_which_one_is_in_another_unit_are_named(tmp_path
     assert max(spans_s, default=0.0) <= 10.0 * period_s  # else deskewing turns each scan by revolutions
 
 
+def test_scans_that_are_logged_in_bursts_have_no_gaps_and_those_without_stamps_have(tmp_path):
+    late = drive(log=lambda k: (4 - k % 5) * STEP_NS)
+    assert diagnose(saved(tmp_path, late))["gaps"].severity == "ok"
+    unstamped = drive(log=lambda k: 20 * STEP_NS * (k > 20), stamp=lambda k: -k * STEP_NS)
+    assert "1 longer than 2.5 periods" in diagnose(saved(tmp_path, unstamped))["gaps"].found
+
+
+@pytest.mark.parametrize(
+    ("ppm", "jitter_ms", "is_noted"), [(1000, 0, True), (-300, 1, True), (10, 0, False), (1000, 15, False)]
+)
+def test_a_clock_that_drifts_against_the_log_is_noted_unless_jitter_hides_it(tmp_path, ppm, jitter_ms, is_noted):
+    late = np.random.default_rng(1).normal(0.0, 1e6 * jitter_ms, 200).astype(int)
+    shifts = {"stamp": lambda k: k * STEP_NS * ppm // 1_000_000, "log": lambda k: int(late[k]) + SECOND // 2}
+    found = diagnose(saved(tmp_path, drive(200, ranges=lambda k: room(0), **shifts)))["stamps"]
+    assert found.severity == ("note" if is_noted else "ok")
+    if is_noted:
+        _, _, rate, _, sense, *_ = found.found.replace(",", "").split()
+        assert sense == ("faster" if ppm > 0 else "slower") and abs(int(rate) - abs(ppm)) <= 30 * jitter_ms
+
+
+def test_steps_back_and_drift_are_those_that_clockdoctor_finds(tmp_path):
+    """Its analysis of the same log, of which it reads the times only."""
+    extract = pytest.importorskip("clockdoctor.extract", reason="clockdoctor is not installed")
+    analyze = pytest.importorskip("clockdoctor.analyze")
+
+    def flags(path):
+        _, rows = extract.extract_to_jsonl(path, topic="/scan")
+        return json.loads(analyze.analyze_jsonl(rows)["timeline_json"].read_text())["flags"]
+
+    back = saved(tmp_path, drive(stamp=lambda k: -2 * STEP_NS * (k % 10 == 9)))
+    (flag,) = (each for each in flags(back) if each["type"] == "out_of_order")
+    assert flag["message"].split()[0] == diagnose(back)["stamps"].found.split()[0] == "4"
+    fast = saved(tmp_path, drive(200, stamp=lambda k: k * STEP_NS // 1000, ranges=lambda k: room(0)))
+    (flag,) = (each for each in flags(fast) if each["type"] == "clock_drift")
+    assert "drifts -1000.0ppm" in flag["message"] and "1,000 ppm faster" in diagnose(fast)["stamps"].found
+
+
 def test_scans_of_two_lasers_at_the_same_instants_have_no_gaps_between_these(tmp_path):
     mountings = ("base_link", "laser", 0.2, 0.0, 0.3, 0.0), ("base_link", "rear", -0.2, 0.0, 0.3, 0.0)
     said = [transforms_said(STAMP_NS, transforms(*mountings))]

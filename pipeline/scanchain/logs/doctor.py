@@ -31,6 +31,7 @@ _LONG_GAP_S = (0.5, 10.0)  # longest gap over which the motion is predicted reli
 _PARTS = (0.3, 1.2)  # scan duration over period outside which a time unit is implausible
 _FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
 _MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
+_LEAST_DRIFT, _CLEAR_DRIFT, _LEAST_SPAN_S = 2e-5, 3.0, 10.0  # rate above those of quartzes, drift over jitter, log
 _FEW_POINTS = 50  # number of returns below which matches are weak
 
 
@@ -185,7 +186,8 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
 
 
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
-    steps_s = np.diff(seen.log_times_ns) * 1e-9
+    logged_ns, stamps_ns = np.diff([seen.log_times_ns, seen.stamps_ns])  # scans logged in bursts have no gaps
+    steps_s = 1e-9 * (np.minimum(logged_ns, stamps_ns) if stamps_ns.any() else logged_ns)
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
     periods = f"{_GAP_PERIODS:g} periods" + (f" of {seen.period_s:.3g} s" if seen.period_s else "")
     if not len(gaps):
@@ -208,16 +210,31 @@ def _stamps(seen: Survey) -> Finding:
     if seen.log.jumps:
         effect = "speeds are by header stamps; gaps, --start and --end by log times: correct the wrong ones"
         if "jump" in seen.log.jumps[0]:
-            effect = (
-                "the motion over a jump is unknown: a loop closure may join the segments; else run them separately"
-            )
+            effect = "the motion over a jump is unknown: a loop may join the segments; else run them separately"
         return Finding("stamps", Severity.WARNING, "; ".join(seen.log.jumps), effect)
     back_s = -1e-9 * np.diff(seen.stamps_ns)
-    count = int(np.count_nonzero(back_s > 0.0))
-    if not count:
-        return Finding("stamps", Severity.OK, "none steps back")
-    found = f"{counted(count, 'step')} back, by up to {back_s.max():.2g} s"
-    return Finding("stamps", Severity.NOTE, found, "they jitter: scans are processed in the order of the log")
+    if count := int(np.count_nonzero(back_s > 0.0)):
+        found = f"{counted(count, 'step')} back, by up to {back_s.max():.2g} s"
+        return Finding("stamps", Severity.NOTE, found, "they jitter: scans are processed in the order of the log")
+    if drift := _drift(seen):
+        effect = (
+            "stamps of another clock, as of wheels, match the scans in a part of the log only: synchronize both"
+        )
+        return Finding("stamps", Severity.NOTE, drift, effect)
+    return Finding("stamps", Severity.OK, "none steps back")
+
+
+def _drift(seen: Survey) -> str:
+    """How much faster or slower header stamps advance than log times, as text; empty where jitter hides it."""
+    logged_s, stamps_s = 1e-9 * np.cumsum(np.diff([seen.log_times_ns, seen.stamps_ns]), axis=1)
+    if (span_s := float(logged_s.max(initial=0.0))) < _LEAST_SPAN_S:
+        return ""
+    line = np.polyfit(logged_s, stamps_s - logged_s, 1)
+    jitter_s, rate = np.std(stamps_s - logged_s - np.polyval(line, logged_s)), abs(line[0])
+    if rate < max(_LEAST_DRIFT, _CLEAR_DRIFT * jitter_s / span_s):
+        return ""
+    faster = f"{1e6 * rate:,.0f} ppm {'faster' if line[0] > 0.0 else 'slower'}"
+    return f"they advance {faster} than log times, by {rate * span_s:.2g} s over the log"
 
 
 def _wheels(seen: Survey) -> Finding:

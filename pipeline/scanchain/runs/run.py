@@ -9,9 +9,10 @@ from html import escape
 from pathlib import Path
 from time import perf_counter
 
+from scanchain import lie
 from scanchain.ahead import compile_ahead
 from scanchain.clock import announcing_compilation, compiled_s, working_s
-from scanchain.data import Scan, brief
+from scanchain.data import Scan, Trajectory, brief
 from scanchain.errors import InputError, OwnCodeError, ScanchainError, counted
 from scanchain.evaluation import ExpectedErrors, on_the_estimate
 from scanchain.georeference import Georeference
@@ -52,7 +53,9 @@ class Finished:
 
     def _repr_html_(self) -> str:
         """Summary and path, which a notebook shows."""
-        return f"<pre>{escape(self.summary)}</pre>{read_tum(self.path)._repr_html_()}"
+        path = read_tum(self.path)  # lifted into space
+        path = Trajectory(path.stamps_ns, lie.flatten(path.poses)) if self.metrics.dimension == 2 else path
+        return f"<pre>{escape(self.summary)}</pre>{path._repr_html_()}"
 
 
 def run(
