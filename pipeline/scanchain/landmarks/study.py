@@ -27,7 +27,7 @@ from scanchain.landmarks.estimate import (
 )
 from scanchain.landmarks.files import RangeLog, read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, LandmarkData, LinearSystem, Values, linear_system
-from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
+from scanchain.landmarks.ranges import OWN, OWN_UNITS, WHEELS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
 from scanchain.trajectory import write_tum
 
@@ -246,15 +246,20 @@ def study_log(folder: Path, options: Options) -> Study:
 def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[str, str]:
     noise, estimate, share = solution.consistency, solution.minimum.estimate, solution.loss.share
     nodes = counted(len(solution.nodes_s), "pose")
-    forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m = solution.sigmas
+    forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m, range_share = solution.sigmas
     wheels = (
         f"{forward_m:.3g} m forward, {sideways_m:.3g} m sideways, {drift_rad:.3g} rad"
         f" after a meter, {turn_rad:.3g} rad after a radian"
     )
-    own = zip(OWN, estimate.state.calibration, OWN_UNITS, strict=True)
-    found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
+    own = [
+        f"{name} {value:+.3f} ± {sigma:.3f}{unit}"
+        for name, value, sigma, unit in zip(
+            OWN, estimate.state.calibration, solution.covariance.calibration, OWN_UNITS, strict=True
+        )
+    ]
+    found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m and {range_share:.2%} (Student's t)"
     downweighted = int(np.count_nonzero(estimate.weights < _DOWNWEIGHTED * share))
-    state, sensor = "stated" if is_stated else "estimated", float(np.mean(noise.sensor / noise.sensor_freedom))
+    state, sensor = "stated" if is_stated else "estimated", noise.sensor / noise.sensor_freedom
     return {
         "observations": (
             f"{len(log.seen_s):,} of {len(estimate.state.landmarks)} landmarks from {nodes}; they count as "
@@ -264,7 +269,8 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[s
             f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
         ),
         "estimate": f"{1e3 * solution.time_s:.0f} ms, {_ended(solution.minimum, solution.iterations)}",
-        "robot": "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own),
+        "robot": f"estimated: {', '.join(own[:WHEELS])}",
+        "sensor": f"estimated: {', '.join(own[WHEELS:])}",
         "odometry noise": f"{state}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
         "sensor noise": f"estimated: {found}; {_verdict(sensor)}",
         "downweighted": (
