@@ -11,6 +11,8 @@ its optimizer, with the covariance of every pose and landmark where it says so. 
 same, "ours" the whole estimate: dead reckoning, guess, the robot's own errors, all noise, all covariances.
 Methods take turns.
 
+anonymous: that log and simulated ones without barcodes.
+
 nees: normalized estimation errors squared (tests.support.nees) of that log, and of simulated ones
 (tests.support.mrclam) whose systematic errors and noise are drawn anew for every seed: mean and range of seeds.
 """
@@ -24,6 +26,7 @@ import gtsam
 import numpy as np
 
 from scanchain.graph.losses import RobustLoss
+from scanchain.landmarks.association import associated
 from scanchain.landmarks.estimate import from_odometry, minimize
 from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
@@ -197,8 +200,25 @@ def consistency(options):
         row(name, *(f"{mean:.2f} ({low:.2f} to {high:.2f})" for mean, low, high in spread))
 
 
+def without_barcodes(options):
+    row = table("without barcodes", "ATE m", "landmarks found", "logged", "sightings of none")
+
+    def found(name, log):
+        part, solution = associated(log, None)
+        ((accuracy,), *_) = against_truth((solution.minimum.estimate.state,), solution.nodes_s, None, log)
+        counts = len(np.unique(part.subjects)), len(np.unique(log.subjects)), len(log.seen_s) - len(part.seen_s)
+        row(name, f"{accuracy.poses_m:.3f}", *counts)
+
+    found("MRCLAM 6", read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot))
+    for name in ("as MRCLAM", "twice the noise", "6 landmarks"):
+        for seed in range(options.seeds // 2):
+            with TemporaryDirectory() as folder:
+                write_mrclam(Path(folder), World(seed, **WORLDS[name]))
+                found(f"{name}, seed {seed}", read_mrclam(Path(folder), 1))
+
+
 def main():
-    choices = {"linear": linear, "log": real_log, "nees": consistency}
+    choices = {"linear": linear, "log": real_log, "nees": consistency, "anonymous": without_barcodes}
     options = options_of(__doc__, "which", cache=False, which=tuple(choices), robot=1, repeats=9, seeds=6)
     choices[options.which](options)
 

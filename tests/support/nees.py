@@ -61,13 +61,18 @@ def nees(solution, truth, landmarks, heading_rad=HEADING_RAD):
     variance = C[place[:, 2], place[:, 2]] + heading_rad**2
     heading, position = float(np.mean(turned**2 / variance)), distances(off, C, place[:, :2])
     known = np.isfinite(landmarks[:, 0])
+    if not known.any():
+        return Nees(ate_of(off), position, heading, (2.0 * position + heading) / 3.0, np.nan, np.nan)
     of_landmarks = distances((state.landmarks - lie.transform(T, landmarks))[known], C, spot[known])
     values, vectors = np.linalg.eigh(C[np.ix_(spot[known].ravel(), spot[known].ravel())])
     whole = vectors.T @ (state.landmarks - lie.transform(T, landmarks))[known].ravel()
     kept = values > 1e-9 * values[-1]
     of_map = float(np.mean(whole[kept] ** 2 / values[kept]))
-    ate_m = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-    return Nees(ate_m, position, heading, (2.0 * position + heading) / 3.0, of_landmarks, of_map)
+    return Nees(ate_of(off), position, heading, (2.0 * position + heading) / 3.0, of_landmarks, of_map)
+
+
+def ate_of(off):
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
 def aligned(points, others):

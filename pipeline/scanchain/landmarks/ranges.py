@@ -25,7 +25,7 @@ OWN = (
     "range scale", "depth share", "range offset", "bearing offset", "bearing scale", "lever arm",
 )  # fmt: skip
 OWN_UNITS = ("", " m/rad", "", " rad/m", " s", "", "", " m", " rad", "", " m")
-_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3, 0.02, 1.0, 0.05, 0.03, 0.03, 0.1])  # differential drives, cameras
+PRIOR_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3, 0.02, 1.0, 0.05, 0.03, 0.03, 0.1])  # differential drives, cameras
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # steps of the finite differences
 
 
@@ -211,9 +211,7 @@ def consistency(
 
 
 _ANCHOR = 1e-8  # m², rad²: the first pose defines the world frame
-_SENSOR = np.square(
-    [0.03, 0.05, 0.02]
-)  # rad², m², 1; initial value of the noise of bearings, ranges, ranges per m
+SENSOR = np.square([0.03, 0.05, 0.02])  # rad², m², 1; initial value of the noise of bearings, ranges, ranges per m
 _LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4, 1e-4])  # odometry as in OdometryNoise, sensor; rad, m
 _LEAST_FREEDOM = 1e-3  # least redundancy of the observations
 _TURNS, _CHANGE = 20, 0.1  # largest number of noise estimates, and the relative change that ends them
@@ -251,17 +249,20 @@ class RangeSolution:
         return np.sqrt(self.variances).tolist()
 
 
-def _units_of_noise(measured: Matrix) -> Matrix:
+def units_of_noise(measured: Matrix) -> Matrix:
     """Variances (N, 3, 2) of bearings and ranges by sources of unit density: bearing, range, range per meter."""
     unit = np.zeros((len(measured), 3, 2))
     unit[:, 0, 0], unit[:, 1, 1], unit[:, 2, 1] = 1.0, 1.0, measured[:, 1] ** 2
     return unit
 
 
-def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution:
+def solve_range_log(
+    log: RangeLog, noise: OdometryNoise | None, nodes_s: NDArray[np.float64] | None = None
+) -> RangeSolution:
     """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
 
     noise : of the odometry; None to estimate it
+    nodes_s : (K,) times of the poses; None for those of the observations
 
     Bearings and ranges follow Student's t (``StudentLoss``); its scales and the variances of the odometry are
     found by restricted maximum likelihood (``consistency``). Errors of a landmark's successive sightings are
@@ -269,16 +270,17 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
     independent one. Raises InputError if there are too few observations for that.
     """
     begin, solver = working_s(), create_solver(ESTIMATOR)
-    nodes_s, node = np.unique(log.seen_s, return_inverse=True)
+    nodes_s = np.unique(log.seen_s) if nodes_s is None else nodes_s
     landmarks, landmark = np.unique(log.subjects, return_inverse=True)
-    observed, sightings = np.stack([node, landmark], axis=1), SightingPairs(log.seen_s, landmark)
-    unit = _units_of_noise(log.measured)
-    moving, sensing = np.arange(WHEELS), np.arange(WHEELS, len(OWN))
+    observed = np.stack([np.searchsorted(nodes_s, log.seen_s), landmark], axis=1)
+    sightings = SightingPairs(log.seen_s, landmark)
+    unit, every = units_of_noise(log.measured), np.arange(len(OWN))
 
     def measurements(reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
         own = Calibration(
-            OWN, np.append(reckoning.own, np.zeros(len(sensing))), _SIGMA, np.tile(moving, (len(nodes_s) - 1, 1)),
-            reckoning.slope, np.tile(sensing, (len(observed), 1)),
+            OWN, np.append(reckoning.own, np.zeros(len(OWN) - WHEELS)), PRIOR_SIGMA,
+            np.tile(every[:WHEELS], (len(nodes_s) - 1, 1)), reckoning.slope,
+            np.tile(every[WHEELS:], (len(observed), 1)),
         )  # fmt: skip
         return Measurements(
             first_pose=np.zeros(3),
@@ -292,7 +294,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
             landmarks=landmarks,
         )
 
-    stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
+    stated = np.concatenate([(noise or OdometryNoise()).densities, SENSOR])
     reckoning, variances = reckon(log, nodes_s, np.zeros(WHEELS)), stated
     loss, problem = StudentLoss(np.ones(len(observed))), BearingRangeProblem(measurements(reckoning, stated))
     reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)

@@ -21,10 +21,10 @@ def bearing_range(
         ∂(β, q)/∂t = [δ_y/q², −δ_x/q²; −δ_x/q, −δ_y/q],  ∂(β, q)/∂θ = [−1; 0],  ∂(β, q)/∂l = −∂(β, q)/∂t
         r = [β (1 + c₄) + c₃ + c₅ sin(β)/q − bearing, q (1 + c₀ − c₁ (1 − cos β)) + c₂ − c₅ cos(β) − range]
 
-    with the systematic errors c of the sensor: of the ranges a scale, 1 where they are depths along an optical axis
-    and 0 where they are distances, an offset; of the bearings an offset and a scale; the distance by which the
-    sensor is ahead of the pose. A landmark at the position of the pose has no bearing; it is assumed in the
-    measured direction, and only the range has a residual.
+    with the systematic errors c of the sensor: of the ranges a scale, 1 if they are depths along the optical axis
+    and 0 if they are distances, an offset; of the bearings an offset and a scale; the distance by which the sensor
+    is ahead of the pose. A landmark at the position of the pose has no bearing; it is assumed in the measured
+    direction, and only the range has a residual.
 
     poses : (K, 2) x, y, with heading 0, or (K, 3) x, y, θ; landmarks (L, 2); m, rad
     observed (N, 2) pose and landmark, measured (N, 2) bearing rad, range m, whitening (N, 2, 2) W
