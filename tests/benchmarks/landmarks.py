@@ -10,22 +10,32 @@ log: a batch in GTSAM gets the same dead reckoning and guess, Huber weights (k =
 its optimizer, with the covariance of every pose and landmark where it says so. "ours as given" does just the
 same, "ours" the whole estimate: dead reckoning, guess, the robot's own errors, all noise, all covariances.
 Methods take turns.
+
+anonymous: that log and simulated ones without barcodes.
+
+nees: normalized estimation errors squared (tests.support.nees) of that log, and of simulated ones
+(tests.support.mrclam) whose systematic errors and noise are drawn anew for every seed: mean and range of seeds.
 """
 
 import time
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import gtsam
 import numpy as np
 
 from scanchain.graph.losses import RobustLoss
+from scanchain.landmarks.association import associated
 from scanchain.landmarks.estimate import from_odometry, minimize
 from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
-from scanchain.landmarks.ranges import OWN, OdometryNoise, reckon, solve_range_log
+from scanchain.landmarks.ranges import OdometryNoise, reckon, solve_range_log
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth
 from tests.benchmarks.harness import options_of, table
+from tests.support.mrclam import World, write_mrclam
+from tests.support.nees import HEADING_RAD, nees, truth_at
 from tests.support.scenes import DATA
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
@@ -72,10 +82,12 @@ LANDMARK = 10_000_000  # first key of a landmark
 
 def measurements_of(log):
     solved = solve_range_log(log, None)
-    reckoning = reckon(log, solved.nodes_s, np.zeros(len(OWN)))
+    reckoning = reckon(log, solved.nodes_s, np.zeros(5))
     return replace(
-        solved.problem.measurements, motion=reckoning.motion, calibration=no_calibration(reckoning.motion),
-        motion_covariance=reckoning.covariance(OdometryNoise().densities), measured_covariance=np.diag(SIGMAS**2),
+        solved.problem.measurements, motion=reckoning.motion,
+        calibration=no_calibration(reckoning.motion, log.measured),
+        motion_covariance=reckoning.covariance(OdometryNoise().densities),
+        measured_covariance=np.tile(np.diag(SIGMAS**2), (len(log.measured), 1, 1)),
     )  # fmt: skip
 
 
@@ -155,9 +167,60 @@ def real_log(options):
         row(name, f"{np.median(spent):.1f}", f"{spent.min():.1f}", *errors)
 
 
+WORLDS = {
+    "as MRCLAM": {},
+    "no systematic errors": {"systematic": 0.0},
+    "450 s": {"duration_s": 450.0},
+    "twice the noise": {"noise": 2.0},
+    "6 landmarks": {"landmarks": 6},
+    "white noise": {"correlated": 0.0},
+    "distances with 5 cm": {"range_m": 0.05, "range_share": 0.0, "depth": 0.0},
+}
+
+
+def errors_of_log(log, heading_rad):
+    solution = solve_range_log(log, None)
+    place = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True))
+    landmarks = np.array([place[each] for each in solution.problem.measurements.landmarks.tolist()])
+    return nees(solution, truth_at(log, solution.nodes_s), landmarks, heading_rad)
+
+
+def consistency(options):
+    row = table("", "ATE m", "positions", "headings", "poses", "landmarks", "map")
+    row("MRCLAM 6", *(f"{each:.3f}" for each in errors_of_log(
+        read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot), HEADING_RAD)))  # fmt: skip
+    for name, world in WORLDS.items():
+        every = []
+        for seed in range(options.seeds):
+            with TemporaryDirectory() as folder:
+                write_mrclam(Path(folder), World(seed, **world))
+                every.append(errors_of_log(read_mrclam(Path(folder), 1), 0.005))
+        each = np.array(every)
+        spread = zip(each.mean(axis=0), each.min(axis=0), each.max(axis=0), strict=True)
+        row(name, *(f"{mean:.2f} ({low:.2f} to {high:.2f})" for mean, low, high in spread))
+
+
+def without_barcodes(options):
+    row = table("without barcodes", "ATE m", "landmarks found", "logged", "sightings of none")
+
+    def found(name, log):
+        part, solution = associated(log, None)
+        ((accuracy,), *_) = against_truth((solution.minimum.estimate.state,), solution.nodes_s, None, log)
+        counts = len(np.unique(part.subjects)), len(np.unique(log.subjects)), len(log.seen_s) - len(part.seen_s)
+        row(name, f"{accuracy.poses_m:.3f}", *counts)
+
+    found("MRCLAM 6", read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot))
+    for name in ("as MRCLAM", "twice the noise", "6 landmarks"):
+        for seed in range(options.seeds // 2):
+            with TemporaryDirectory() as folder:
+                write_mrclam(Path(folder), World(seed, **WORLDS[name]))
+                found(f"{name}, seed {seed}", read_mrclam(Path(folder), 1))
+
+
 def main():
-    options = options_of(__doc__, "which", cache=False, which=("linear", "log"), robot=1, repeats=9)
-    {"linear": linear, "log": real_log}[options.which](options)
+    choices = {"linear": linear, "log": real_log, "nees": consistency, "anonymous": without_barcodes}
+    options = options_of(__doc__, "which", cache=False, which=tuple(choices), robot=1, repeats=9, seeds=6)
+    choices[options.which](options)
 
 
 if __name__ == "__main__":

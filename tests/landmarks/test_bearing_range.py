@@ -15,11 +15,14 @@ from tests.support.naive_landmarks import numeric_jacobian
 from tests.support.scenes import shared_data
 
 
-def observed(pose, landmark, bearing, reach):
-    """Residual and Jacobian of one bearing and range."""
-    residuals, jacobians = np.empty((1, 2)), np.empty((1, 2, len(pose) + 2))
+def observed(pose, landmark, bearing, reach, own=()):
+    """Residual and Jacobian of one bearing and range, with systematic errors of the sensor."""
+    residuals, jacobians = np.empty((1, 2)), np.empty((1, 2, len(pose) + 2 + len(own)))
     pair, measured = np.zeros((1, 2), np.int64), np.array([[bearing, reach]])
-    factors.bearing_range(pose[None], landmark[None], pair, measured, np.eye(2), residuals, jacobians)
+    factors.bearing_range(
+        pose[None], landmark[None], pair, measured, np.eye(2)[None], np.array(own, float),
+        np.arange(len(own))[None], residuals, jacobians,
+    )  # fmt: skip
     return residuals[0], jacobians[0]
 
 
@@ -35,6 +38,23 @@ def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bea
         return naive_landmarks.bearing_range(x[:size], x[size:], r[0] + bearing, 2.0)  # far from the wrap
 
     assert np.allclose(J, numeric_jacobian(residual, np.concatenate([pose, landmark])), atol=1e-8)
+
+
+@pytest.mark.parametrize("bearing", [0.3, -0.5, np.pi - 1e-9])
+def test_the_sensors_systematic_errors_equal_the_naive_ones_and_finite_differences(bearing):
+    rng = np.random.default_rng(2)
+    own = 0.1 * rng.normal(size=6) + np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+    pose, landmark = (
+        np.array([1.0, -2.0, 2.8]),
+        np.array([1.0, -2.0]) + 3.0 * np.array([np.cos(2.8 + 0.2), np.sin(2.8 + 0.2)]),
+    )
+    r, J = observed(pose, landmark, bearing, 2.0, own)
+    assert np.allclose(r, naive_landmarks.bearing_range(pose, landmark, bearing, 2.0, own), atol=1e-12)
+
+    def residual(x):
+        return naive_landmarks.bearing_range(x[:3], x[3:5], bearing, 2.0, x[5:])
+
+    assert np.allclose(J, numeric_jacobian(residual, np.concatenate([pose, landmark, own])), atol=1e-7)
 
 
 def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
@@ -140,10 +160,10 @@ def measurements(seed=0, unit=1.0, outliers=0):
         first_covariance=1e-6 * np.diag(scale**2),
         motion=motion * scale,
         motion_covariance=np.tile(np.diag((sigma * scale) ** 2), (39, 1, 1)),
-        calibration=no_calibration(motion),
+        calibration=no_calibration(motion, reach[:, None].repeat(2, axis=1)),
         observed=observed,
         measured=np.stack([naive_landmarks.wrapped(bearing), reach / unit], axis=1),
-        measured_covariance=np.diag([0.02**2, (0.05 / unit) ** 2]),
+        measured_covariance=np.tile(np.diag([0.02**2, (0.05 / unit) ** 2]), (len(reach), 1, 1)),
         landmarks=np.arange(6),
     )
     return poses, landmarks, given

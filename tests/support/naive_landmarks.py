@@ -7,11 +7,18 @@ def wrapped(angle):
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
-def bearing_range(pose, landmark, bearing, reach):
-    """Predicted minus measured bearing and range of a landmark from a pose (x, y) or (x, y, heading)."""
+def bearing_range(pose, landmark, bearing, reach, own=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)):
+    """Predicted minus measured bearing and range of a landmark from a pose (x, y) or (x, y, heading).
+
+    own : the sensor's range scale, depth share, range offset, bearing offset, bearing scale, and lever arm
+    """
     heading = pose[2] if len(pose) == 3 else 0.0
+    scale, depth, offset, turned, stretched, ahead = own
     dx, dy = landmark - pose[:2]
-    return np.array([wrapped(np.arctan2(dy, dx) - heading - bearing), np.hypot(dx, dy) - reach])
+    q = np.hypot(dx, dy)
+    true = bearing + wrapped(np.arctan2(dy, dx) - heading - bearing)  # of the turns that are equal, the nearest
+    along = (1.0 - depth) * q + depth * q * np.cos(true) + scale * q + offset - ahead * np.cos(true)
+    return np.array([true + turned + stretched * true + ahead * np.sin(true) / q - bearing, along - reach])
 
 
 def odometry(first, second, moved):

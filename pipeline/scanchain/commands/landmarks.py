@@ -23,6 +23,7 @@ _OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinea
 _ALONE = {  # options that apply to one kind of problem only
     "robot": ("--robot", *_OF_LOGS),
     "noise": ("--odometry-noise", *_OF_LOGS),
+    "ignore_barcodes": ("--ignore-barcodes", *_OF_LOGS),
     "guess": ("--guess", *_OF_NONLINEAR),
     "optimizer": ("--optimizer", *_OF_NONLINEAR),
 }
@@ -54,6 +55,11 @@ _ALONE = {  # options that apply to one kind of problem only
     "noise",
     metavar="FORWARD,SIDEWAYS,DRIFT,TURN",
     help="Standard deviations of an MRCLAM robot: m, m, rad per meter; rad per radian. [default: estimated]",
+)
+@click.option(
+    "--ignore-barcodes",
+    is_flag=True,
+    help="Of an MRCLAM log, find which landmark a sighting is of; barcodes only tell robots from landmarks.",
 )
 @click.option(
     "--guess",
@@ -97,6 +103,7 @@ def landmarks(
       scanchain landmarks 2d_nonlinear.npz --guess origin --methods cholesky,schur --out runs/nonlinear
       scanchain landmarks 2d_nonlinear.npz --optimizer gauss-newton --out runs/gn --recording gn.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
+      scanchain landmarks MRCLAM_Dataset6 --ignore-barcodes --out runs/anonymous
     """
     from scanchain.clock import announcing_compilation
     from scanchain.commands.terminal import Terminal

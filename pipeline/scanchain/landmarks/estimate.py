@@ -14,8 +14,9 @@ from scanchain.graph.minimizer import Descent, LocalModel, Optimizer, descend, s
 from scanchain.landmarks.problem import BearingRangeProblem, Linearization, Measurements, Values
 from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
 
-_FIRST, _GROWTH = 16, 2  # number of poses of the first part, and growth factor of each further one
-_STEPS = 2  # iterations of the optimizer on each part
+_FIRST, _GROWTH = 16, 1.7  # number of poses of the first part, and growth factor of each further one
+_STEPS, _ROUGHLY, _LIGHT = 4, 0.1, 1e-6  # of the optimizer on each part: iterations, change of the cost that ends
+# them, first damping
 _CONVEX = RobustLoss("huber", 1.345, 1.0)
 
 
@@ -25,9 +26,8 @@ def from_odometry(measurements: Measurements) -> Values:
         poses = chain(measurements.first_pose, measurements.motion)
     else:
         poses = measurements.first_pose + np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
-    return Values(
-        poses, _first_seen(measurements, poses, _relative(measurements, poses)), measurements.calibration.value
-    )
+    own = measurements.calibration.value
+    return Values(poses, _first_seen(measurements, poses, _relative(measurements, poses)), own)
 
 
 def of_relative_positions(measurements: Measurements) -> Values:
@@ -50,6 +50,7 @@ def growing(measurements: Measurements, solver: LinearSolver) -> Values:
 
     Dead reckoning over the whole log may be meters off, so that a robust loss finds only a local minimum; over the
     second half of a part, from optimized poses and landmarks, it is not. The loss is convex in the residuals.
+    Systematic errors of the sensor are left out, as a short part does not constrain them.
     """
     count = len(measurements.motion) + 1
     poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)
@@ -57,32 +58,36 @@ def growing(measurements: Measurements, solver: LinearSolver) -> Values:
     own = np.zeros_like(calibration.sigma)
     while True:
         reach = min(reach, count)
-        motion = measurements.motion + calibration.slope @ (own - calibration.value)  # to first order
+        motion = calibration.moved(measurements.motion, own)
         poses = np.vstack([poses, chain(poses[-1], motion[len(poses) - 1 : reach - 1])[1:]])
         part, known = _beginning(measurements, reach)
         guess = _first_seen(part, poses, _relative(part, poses))
         settled = np.isfinite(landmarks[known, 0])
         guess[settled] = landmarks[known[settled]]
         state = minimize(
-            BearingRangeProblem(part), Values(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS
-        ).estimate.state
+            BearingRangeProblem(part), Values(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS,
+            tolerance=_ROUGHLY, first_damping=_LIGHT,
+        ).estimate.state  # fmt: skip
         poses, landmarks[known], own = state.poses, state.landmarks, state.calibration
         if reach == count:
             return Values(poses, landmarks, own)
-        reach *= _GROWTH
+        reach = int(reach * _GROWTH)
 
 
 def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, NDArray[np.int64]]:
     """The problem of the first ``poses`` poses, and the landmarks observed from them."""
-    kept = measurements.observed[:, 0] < poses
+    kept, own = measurements.observed[:, 0] < poses, measurements.calibration
     known, landmark = np.unique(measurements.observed[kept, 1], return_inverse=True)
     part = replace(
         measurements,
         motion=measurements.motion[: poses - 1],
         motion_covariance=measurements.motion_covariance[: poses - 1],
-        calibration=replace(measurements.calibration, slope=measurements.calibration.slope[: poses - 1]),
+        calibration=replace(
+            own, moving=own.moving[: poses - 1], slope=own.slope[: poses - 1], sensing=own.sensing[kept, :0]
+        ),
         observed=np.stack([measurements.observed[kept, 0], landmark], axis=1),
         measured=measurements.measured[kept],
+        measured_covariance=measurements.measured_covariance[kept],
         landmarks=measurements.landmarks[known],
     )
     return part, known
@@ -112,6 +117,7 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
 
 
 _FREEDOM = 4.0  # ν of Student's t: heavy tails with a finite variance
+_SCALINGS, _LEAST_CHI2 = 10, 1e-12  # iterations of a scale; χ² of exact data, which have no scale
 _SCALE2 = _FREEDOM + 2.0  # up to a factor absorbed by σ, the weight (ν + 2) / (ν + χ²) is s² / (s² + χ²)
 
 
@@ -131,6 +137,18 @@ class StudentLoss:
     def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
         """Loss, which is the share times χ² near zero, (N,)."""
         return self.share * _SCALE2 * np.log1p(chi2 / _SCALE2)
+
+    def efficiency(self, chi2: NDArray[np.float64]) -> float:
+        """Information of an observation over its weight: E[ψ′]² / (E[ψ²] E[w]), ψ = w r (Huber 1981, 7.6).
+
+        With r in two dimensions and the same in each, E[ψ′] = E[w + w′ χ²] and E[ψ²] = E[w² χ²] / 2.
+        """
+        chi2 = np.maximum(chi2, _LEAST_CHI2)
+        for _ in range(_SCALINGS):  # to E[w χ²] = 2: the residuals lack what the state absorbed
+            chi2 = chi2 * 2.0 / np.average(_SCALE2 / (_SCALE2 + chi2) * chi2, weights=self.share)
+        w = _SCALE2 / (_SCALE2 + chi2)
+        slope, square = np.average([w - w**2 * chi2 / _SCALE2, w**2 * chi2 / 2.0], axis=1, weights=self.share)
+        return float(slope**2 / (square * np.average(w, weights=self.share)))
 
 
 QUADRATIC = RobustLoss("none", 1.0, 1.0)

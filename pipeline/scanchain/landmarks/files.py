@@ -55,10 +55,10 @@ def read_landmark_data(path: Path) -> LandmarkData:
         first_covariance=FIRST_SHARE**2 * covariance,
         motion=odometry,
         motion_covariance=np.broadcast_to(covariance, (len(odometry), 2, 2)),
-        calibration=no_calibration(odometry),
+        calibration=no_calibration(odometry, table[:, 2:]),
         observed=observed,
         measured=np.ascontiguousarray(table[:, 2:]),
-        measured_covariance=_covariance(path, "sigma_landmark", arrays),
+        measured_covariance=np.broadcast_to(_covariance(path, "sigma_landmark", arrays), (len(table), 2, 2)),
         landmarks=np.arange(len(landmarks)),
     )
     return LandmarkData(path.stem, kind, measurements, poses, landmarks)

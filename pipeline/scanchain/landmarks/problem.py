@@ -183,7 +183,7 @@ def linear_system(given: Measurements) -> LinearSystem:
     step's, affects only the covariance.
     """
     layout = Layout(len(given.motion) + 1, 2, given.landmarks)
-    W_odometry, W_observation = whitening(given.motion_covariance[0]), whitening(given.measured_covariance)
+    W_odometry, W_observation = whitening(given.motion_covariance[0]), whitening(given.measured_covariance[0])
     poses = pose_columns(layout, np.arange(layout.poses))
     seen_from, seen = given.observed.T
     steps, stepped = _differences(W_odometry, poses[:-1], poses[1:])
@@ -199,7 +199,7 @@ class Linearization:
     """Whitened residuals r at a state and the values of A = ∂r/∂x there.
 
     prior, calibration, odometry, observations : residuals (p,), (C,), (K − 1, p), (N, 2); pure numbers
-    odometry_rows, observation_rows : of A: (K − 1, p, 2 p + C), (N, 2, p + 2)
+    odometry_rows, observation_rows : of A: (K − 1, p, 2 p + A), (N, 2, p + 2 + B)
     """
 
     prior: NDArray[np.float64]
@@ -209,24 +209,37 @@ class Linearization:
     odometry_rows: Matrix
     observation_rows: Matrix
 
+    @property
+    def chi2(self) -> NDArray[np.float64]:
+        """χ² of every observation, (N,)."""
+        return np.square(self.observations).sum(axis=1)
+
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Unknowns common to all motions of the robot.
+    """Systematic errors of the wheels, common to all motions, and of the sensor, common to all observations.
 
-    value : (C,) at which the motions were computed; slope (K − 1, p, C) their derivative by the unknowns
-    sigma : (C,) prior about zero
+    names, value, sigma : (C,) the value for which the motions were computed, and the prior's about zero
+    moving, slope : (K − 1, A), (K − 1, p, A) unknowns of a motion, the first its scale, and its derivative by them
+    sensing : (N, B) unknowns of an observation
     """
 
     names: tuple[str, ...]
     value: NDArray[np.float64]
-    slope: Matrix
     sigma: NDArray[np.float64]
+    moving: NDArray[np.int64]
+    slope: Matrix
+    sensing: NDArray[np.int64]
+
+    def moved(self, motion: Matrix, value: NDArray[np.float64]) -> Matrix:
+        """Motions (K − 1, p) for another value (C,), to first order."""
+        return motion + (self.slope @ (value - self.value)[self.moving][..., None])[..., 0]
 
 
-def no_calibration(motion: Matrix) -> Calibration:
-    """Calibration without parameters, of motions (K − 1, p)."""
-    return Calibration((), np.zeros(0), np.zeros((*motion.shape, 0)), np.zeros(0))
+def no_calibration(motion: Matrix, measured: Matrix) -> Calibration:
+    """Calibration without parameters, of motions (K − 1, p) and observations (N, 2)."""
+    nothing, (moving, sensing) = np.zeros(0), (np.zeros((len(each), 0), np.int64) for each in (motion, measured))
+    return Calibration((), nothing, nothing, moving, np.zeros((*motion.shape, 0)), sensing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +250,7 @@ class Measurements:
     motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
         of the former, without in the world's
     observed : (N, 2) pose, landmark
-    measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; one covariance for all
+    measured, measured_covariance : (N, 2), (N, 2, 2) bearing in rad, range in m
     landmarks : (L,) their names, as numbers
     """
 
@@ -255,8 +268,8 @@ class Measurements:
 class BearingRangeProblem:
     """Prior on the first pose, motion from pose to pose, bearings and ranges.
 
-    ``motion_columns`` (K − 1, 2 p + C) and ``observation_columns`` (N, p + 2) are the columns of their unknowns,
-    ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
+    ``motion_columns`` (K − 1, 2 p + A) and ``observation_columns`` (N, p + 2 + B) are the columns of their
+    unknowns, ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
     """
 
     def __init__(self, measurements: Measurements) -> None:
@@ -264,14 +277,14 @@ class BearingRangeProblem:
         self.measurements = given
         size = given.motion.shape[1]
         layout = Layout(len(given.motion) + 1, size, given.landmarks, given.calibration.names)
-        self._first, self._observation = whitening(given.first_covariance), whitening(given.measured_covariance)
-        self.motion_whitening = whitening(given.motion_covariance)
-        self._slope = -self.motion_whitening @ given.calibration.slope
+        self._first, self.motion_whitening = whitening(given.first_covariance), whitening(given.motion_covariance)
+        self._observation = np.ascontiguousarray(whitening(given.measured_covariance))
         poses = pose_columns(layout, np.arange(layout.poses))
         own = np.arange(layout.split, layout.landmark_start)
         seen_from, seen = given.observed.T
-        pairs = np.concatenate([poses[seen_from], landmark_columns(layout, seen)], axis=1)
-        moves = np.concatenate([poses[:-1], poses[1:], np.tile(own, (len(given.motion), 1))], axis=1)
+        sensing, moving = (layout.split + each for each in (given.calibration.sensing, given.calibration.moving))
+        pairs = np.concatenate([poses[seen_from], landmark_columns(layout, seen), sensing], axis=1)
+        moves = np.concatenate([poses[:-1], poses[1:], moving], axis=1)
         groups = [
             np.repeat(poses[:1], size, axis=0), own[:, None], np.repeat(moves, size, axis=0),
             np.repeat(pairs, 2, axis=0),
@@ -281,23 +294,32 @@ class BearingRangeProblem:
         self.pattern, self._damped = pattern_of(groups, layout), pattern_of([*groups, damping], layout)
 
     def linearize(self, state: Values) -> Linearization:
-        """Residuals and Jacobians at a state."""
-        given, p = self.measurements, state.poses.shape[1]
+        """Residuals and Jacobians at a state.
+
+        A motion's residual is divided by the scale of the logged distances: noise of a fixed variance in the
+        world's units would favor a small world, as the scale of the ranges is unknown as well.
+        """
+        given, p, W = self.measurements, state.poses.shape[1], self.motion_whitening
         calibration = given.calibration
         motion, J_motion = np.empty(given.motion.shape), np.empty((len(given.motion), p, 2 * p))
-        if p == 3:
-            factors.odometry(state.poses, given.motion, self.motion_whitening, motion, J_motion)
-        else:
-            W = self.motion_whitening
+        if p == 2:
             motion = (W @ (np.diff(state.poses, axis=0) - given.motion)[..., None])[..., 0]
             J_motion = np.concatenate([-W, W], axis=-1)
-        motion += self._slope @ (state.calibration - calibration.value)
-        J_motion = np.concatenate([J_motion, self._slope], axis=-1)
+        elif not calibration.names:
+            factors.odometry(state.poses, given.motion, W, motion, J_motion)
+        else:
+            scale = 1.0 + state.calibration[calibration.moving[:, :1]]
+            W = W / np.concatenate([scale, scale, np.ones_like(scale)], axis=1)[:, None]
+            factors.odometry(state.poses, calibration.moved(given.motion, state.calibration), W, motion, J_motion)
+            slope = -W @ calibration.slope
+            slope[..., 0] -= (motion - W[..., 2] * motion[:, 2:] / W[:, 2, 2:]) / scale
+            J_motion = np.concatenate([J_motion, slope], axis=-1)
         seen = np.empty(given.measured.shape)
-        J_seen = np.empty((len(seen), 2, p + 2))
+        J_seen = np.empty((len(seen), 2, p + 2 + calibration.sensing.shape[1]))
         factors.bearing_range(
-            state.poses, state.landmarks, given.observed, given.measured, self._observation, seen, J_seen
-        )
+            state.poses, state.landmarks, given.observed, given.measured, self._observation, state.calibration,
+            calibration.sensing, seen, J_seen,
+        )  # fmt: skip
         off = state.poses[0] - given.first_pose
         off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
         own = state.calibration / calibration.sigma

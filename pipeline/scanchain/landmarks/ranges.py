@@ -19,9 +19,13 @@ from scanchain.trajectory import LEAST_VARIANCE
 
 _AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² per second, whether or not the robot moves
 
-OWN = ("forward scale", "forward lost in turning", "turn scale", "drift", "delay")
-OWN_UNITS = ("", " m/rad", "", " rad/m", " s")
-_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # typical of differential drives; the units as above
+WHEELS = 5  # number of unknowns of the wheels, which come before those of the sensor
+OWN = (
+    "forward scale", "forward lost in turning", "turn scale", "drift", "delay",
+    "range scale", "depth share", "range offset", "bearing offset", "bearing scale", "lever arm",
+)  # fmt: skip
+OWN_UNITS = ("", " m/rad", "", " rad/m", " s", "", "", " m", " rad", "", " m")
+PRIOR_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3, 0.02, 1.0, 0.05, 0.03, 0.03, 0.1])  # differential drives, cameras
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # steps of the finite differences
 
 
@@ -49,13 +53,14 @@ class Reckoning:
 
     motion : (K − 1, 3) from each node to the next, in the frame of the former
     sources, rest : (K − 1, 4, 3, 3), (K − 1, 3, 3) its covariance by each source of unit density, and the rest
-    calibration : errors of the robot's velocities, and the motion's Jacobian
+    own, slope : (5,) errors of the robot's velocities that are corrected, (K − 1, 3, 5) the motion's Jacobian
     """
 
     motion: Matrix
     sources: Matrix
     rest: Matrix
-    calibration: Calibration
+    own: NDArray[np.float64]
+    slope: Matrix
 
     def covariance(self, densities: NDArray[np.float64]) -> Matrix:
         """Covariance of every motion, (K − 1, 3, 3)."""
@@ -74,7 +79,7 @@ def reckon(log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64]
         ahead, _ = _integrated(log, nodes_s, own + step, sources=0)
         slope[..., column] = (ahead - motion) / _STEP[column]
     rest = np.diff(nodes_s)[:, None, None] * np.diag(_AT_REST) + LEAST_VARIANCE * np.eye(3)
-    return Reckoning(motion, sources, rest, Calibration(OWN, own, slope, _SIGMA))
+    return Reckoning(motion, sources, rest, own, slope)
 
 
 def _integrated(
@@ -92,8 +97,9 @@ def _integrated(
 
 
 _LAGS_S = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])  # bin edges; errors farther apart count as independent
+_DRAWS = 8  # samples of the uncertainty of the state
 _FEWEST = 30  # least number of pairs from which a correlation is estimated
-_STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that the prior noise counts as
+_STATED = np.array([10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0])  # degrees of freedom that the prior noise counts as
 _LEAST_REDUNDANCY = 0.05  # least redundancy as a share of the sightings
 
 
@@ -113,12 +119,24 @@ class SightingPairs:
         self._lag = np.searchsorted(_LAGS_S, seen_s[self._second] - seen_s[self._first], side="right") - 1
         self._count = len(seen_s)
 
-    def correlation(self, residuals: Matrix) -> NDArray[np.float64]:
-        """Correlation of residuals (N, 2) by lag, pooled over bearings and ranges; it never grows with the lag."""
-        bins = len(_LAGS_S) - 1
-        products = residuals[self._first] * residuals[self._second] / np.mean(residuals**2, axis=0)
-        sums = np.bincount(self._lag, products.mean(axis=1), bins)
-        found = sums / np.maximum(np.bincount(self._lag, minlength=bins), _FEWEST)
+    def correlation(self, residuals: Matrix, absorbed: Matrix) -> NDArray[np.float64]:
+        """Correlation of errors by lag, pooled over bearings and ranges; it never grows with the lag.
+
+        The state absorbs a part of errors of covariance Σ: residuals have E[r rᵀ] = Σ − J C Jᵀ. That part is added
+        as the mean of samples.
+
+        residuals, absorbed : (N, 2), (S, N, 2) r in units of the noise, and J x for steps x of covariance C
+        """
+        counts = np.bincount(self._lag, minlength=len(_LAGS_S) - 1)
+        known = np.flatnonzero(counts >= _FEWEST)
+        if not len(known):
+            return np.zeros(len(counts))
+        every = np.concatenate([residuals[None], absorbed / len(absorbed) ** 0.5])
+        every /= np.sqrt(2.0 * np.square(every).sum(axis=0).mean(axis=0))
+        every = np.ascontiguousarray(every.transpose(1, 0, 2).reshape(len(residuals), -1))
+        sums = np.zeros(len(counts))
+        factors.lagged_products(self._first, self._second, self._lag, every, sums)
+        found = np.interp(np.arange(len(counts)), known, sums[known] / counts[known])
         return np.minimum.accumulate(np.clip(found, 0.0, 1.0)).astype(np.float64)
 
     def share(self, correlation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -132,28 +150,24 @@ class SightingPairs:
 class Consistency:
     """Consistency of an estimate's residuals with its noise model.
 
-    motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
-    motion_freedom, redundancy : degrees of freedom of these: observations minus those absorbed by the state
-    sensor_freedom : the redundancy, at least a small share of the effective number of observations, (2,)
-    sources, sources_freedom : (4,) the parts of ``motion`` and of its degrees of freedom due to each source
+    motion, sensor : χ² of the motions, of bearings and ranges, weighed
+    motion_freedom, sensor_freedom : degrees of freedom of these: measurements minus those absorbed by the state
+    sources, sources_freedom : (7,) the parts of these due to each source of noise
     """
 
     motion: float
     motion_freedom: float
+    sensor: float
+    sensor_freedom: float
     sources: NDArray[np.float64]
     sources_freedom: NDArray[np.float64]
-    sensor: NDArray[np.float64]
-    redundancy: NDArray[np.float64]
-    sensor_freedom: NDArray[np.float64]
 
     def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Factors by which the variances, those of odometry first, should grow, (6,); one where they are right.
+        """Factors by which the variances, those of odometry first, should grow, (7,); one where they are right.
 
-        stated : (6,) their prior values, in units of the present ones
+        stated : (7,) their prior values, in units of the present ones
         """
-        chi2 = np.concatenate([self.sources, self.sensor])
-        freedom = np.concatenate([self.sources_freedom, self.sensor_freedom])
-        return (chi2 + _STATED * stated) / (freedom + _STATED)
+        return (self.sources + _STATED * stated) / (self.sources_freedom + _STATED)
 
 
 def consistency(
@@ -161,16 +175,18 @@ def consistency(
     minimum: Minimum,
     covariance: Covariance,
     sources: Matrix,
+    seen_sources: Matrix,
     share: NDArray[np.float64],
+    efficiency: float,
 ) -> Consistency:
     """Compare residuals with their expectation under the noise model.
 
     With r a whitened motion, W its whitening, H = J C Jᵀ its leverage and V = Σ Vₛ its covariance by sources, the
     part of source s is rᵀ(W Vₛ Wᵀ)r, and tr(W Vₛ Wᵀ(I − H)) its expectation (Harville 1977). For observations
-    with weights w, each counting as the share ``share`` (N,) of an independent one, they are Σ w r² and
-    Σ share − w h (Lange et al. 1989).
+    with weights w and efficiency e, each counting as the share ``share`` (N,) of an independent one, they are
+    Σ w r² and Σ share − e w h (Lange et al. 1989), divided in proportion to the sources' variances.
 
-    sources : (K − 1, 4, 3, 3) covariance of every motion by sources
+    sources, seen_sources : (K − 1, 4, 3, 3), (N, 3, 2) covariance of motions, variances of bearings and ranges
     """
     at, W = minimum.estimate.at, problem.motion_whitening
     parts = W[:, None] @ sources @ np.swapaxes(W, 1, 2)[:, None]
@@ -178,21 +194,25 @@ def consistency(
     r = at.odometry
     rows, weights = at.observation_rows, minimum.estimate.weights[:, None]
     h = ((rows @ covariance.of(problem.observation_columns)) * rows).sum(axis=-1)
-    redundancy = (share[:, None] - weights * h).sum(axis=0)
+    seen, freedom = weights * at.observations**2, share[:, None] - efficiency * weights * h
+    seen_parts = seen_sources / seen_sources.sum(axis=1, keepdims=True)
+    least = _LEAST_REDUNDANCY * (seen_parts * share[:, None, None]).sum(axis=(0, 2))
+    of_motion = ((r[:, None, None, :] @ parts)[:, :, 0] * r[:, None]).sum(axis=(0, 2))
+    motion_freedom = (parts * (np.eye(3) - leverage)[:, None]).sum(axis=(0, 2, 3))
+    of_seen, seen_freedom = ((seen_parts * each[:, None]).sum(axis=(0, 2)) for each in (seen, freedom))
     return Consistency(
         motion=float(np.square(r).sum()),
         motion_freedom=float(r.size - np.trace(leverage, axis1=1, axis2=2).sum()),
-        sources=((r[:, None, None, :] @ parts)[:, :, 0] * r[:, None]).sum(axis=(0, 2)),
-        sources_freedom=(parts * (np.eye(3) - leverage)[:, None]).sum(axis=(0, 2, 3)),
-        sensor=(weights * at.observations**2).sum(axis=0),
-        redundancy=redundancy,
-        sensor_freedom=np.maximum(redundancy, _LEAST_REDUNDANCY * share.sum()),
+        sensor=float(seen.sum()),
+        sensor_freedom=float(freedom.sum()),
+        sources=np.concatenate([of_motion, of_seen]),
+        sources_freedom=np.concatenate([motion_freedom, np.maximum(seen_freedom, least)]),
     )
 
 
 _ANCHOR = 1e-8  # m², rad²: the first pose defines the world frame
-_SENSOR = np.square([0.03, 0.12])  # rad², m²; initial value of the sensor's noise
-_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # odometry as in OdometryNoise, sensor; rad, m
+SENSOR = np.square([0.03, 0.05, 0.02])  # rad², m², 1; initial value of the noise of bearings, ranges, ranges per m
+_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4, 1e-4])  # odometry as in OdometryNoise, sensor; rad, m
 _LEAST_FREEDOM = 1e-3  # least redundancy of the observations
 _TURNS, _CHANGE = 20, 0.1  # largest number of noise estimates, and the relative change that ends them
 _RECKONED = 2  # number of these after which dead reckoning is repeated with the calibration found so far
@@ -207,7 +227,7 @@ class RangeSolution:
     reckoned : dead reckoning by the logged velocities, every landmark where it was first seen
     problem, guess, minimum : problem with the estimated noise; initial guess of the first minimization; result of
         the last one, with the first pose at the origin
-    variances : (6,) of the odometry's sources as in ``OdometryNoise``, of bearing and range
+    variances : (7,) of the odometry's sources as in ``OdometryNoise``, of bearings, of ranges, of these per meter
     iterations, time_s : steps after the guess; total time, without reading
     """
 
@@ -225,14 +245,24 @@ class RangeSolution:
 
     @property
     def sigmas(self) -> list[float]:
-        """Standard deviations of the odometry's sources, of bearing in rad and range in m."""
+        """Standard deviations of the odometry's sources, of bearing in rad, range in m and range per m."""
         return np.sqrt(self.variances).tolist()
 
 
-def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution:
+def units_of_noise(measured: Matrix) -> Matrix:
+    """Variances (N, 3, 2) of bearings and ranges by sources of unit density: bearing, range, range per meter."""
+    unit = np.zeros((len(measured), 3, 2))
+    unit[:, 0, 0], unit[:, 1, 1], unit[:, 2, 1] = 1.0, 1.0, measured[:, 1] ** 2
+    return unit
+
+
+def solve_range_log(
+    log: RangeLog, noise: OdometryNoise | None, nodes_s: NDArray[np.float64] | None = None
+) -> RangeSolution:
     """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
 
     noise : of the odometry; None to estimate it
+    nodes_s : (K,) times of the poses; None for those of the observations
 
     Bearings and ranges follow Student's t (``StudentLoss``); its scales and the variances of the odometry are
     found by restricted maximum likelihood (``consistency``). Errors of a landmark's successive sightings are
@@ -240,25 +270,32 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
     independent one. Raises InputError if there are too few observations for that.
     """
     begin, solver = working_s(), create_solver(ESTIMATOR)
-    nodes_s, node = np.unique(log.seen_s, return_inverse=True)
+    nodes_s = np.unique(log.seen_s) if nodes_s is None else nodes_s
     landmarks, landmark = np.unique(log.subjects, return_inverse=True)
-    observed, sightings = np.stack([node, landmark], axis=1), SightingPairs(log.seen_s, landmark)
+    observed = np.stack([np.searchsorted(nodes_s, log.seen_s), landmark], axis=1)
+    sightings = SightingPairs(log.seen_s, landmark)
+    unit, every = units_of_noise(log.measured), np.arange(len(OWN))
 
     def measurements(reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
+        own = Calibration(
+            OWN, np.append(reckoning.own, np.zeros(len(OWN) - WHEELS)), PRIOR_SIGMA,
+            np.tile(every[:WHEELS], (len(nodes_s) - 1, 1)), reckoning.slope,
+            np.tile(every[WHEELS:], (len(observed), 1)),
+        )  # fmt: skip
         return Measurements(
             first_pose=np.zeros(3),
             first_covariance=_ANCHOR * np.eye(3),
             motion=reckoning.motion,
             motion_covariance=reckoning.covariance(variances[:4]),
-            calibration=reckoning.calibration,
+            calibration=own,
             observed=observed,
             measured=log.measured,
-            measured_covariance=np.diag(variances[4:]),
+            measured_covariance=(variances[4:] @ unit)[..., None] * np.eye(2),
             landmarks=landmarks,
         )
 
-    stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
-    reckoning, variances = reckon(log, nodes_s, np.zeros(len(OWN))), stated
+    stated = np.concatenate([(noise or OdometryNoise()).densities, SENSOR])
+    reckoning, variances = reckon(log, nodes_s, np.zeros(WHEELS)), stated
     loss, problem = StudentLoss(np.ones(len(observed))), BearingRangeProblem(measurements(reckoning, stated))
     reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
     state, iterations, turn, is_last = guess, 0, 0, False
@@ -268,10 +305,12 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
             max_iterations=_MOST,
         )  # fmt: skip
         iterations += minimum.iterations
-        covariance = Covariance(problem.system(minimum.estimate.at, minimum.estimate.weights))
-        sources = variances[:4, None, None] * reckoning.sources
-        found = consistency(problem, minimum, covariance, sources, loss.share)
-        if turn == 0 and not np.all(found.redundancy > _LEAST_FREEDOM):
+        at, weights = minimum.estimate.at, minimum.estimate.weights
+        efficiency = loss.efficiency(at.chi2)
+        covariance = Covariance(problem.system(at, efficiency * weights))
+        sources, seen_sources = variances[:4, None, None] * reckoning.sources, variances[4:, None] * unit
+        found = consistency(problem, minimum, covariance, sources, seen_sources, loss.share, efficiency)
+        if turn == 0 and not found.sensor_freedom > _LEAST_FREEDOM:
             raise InputError(
                 "the landmarks were seen too seldom to estimate the sensor's noise; give a longer log"
             )
@@ -283,11 +322,13 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
         turn += 1
         is_last = turn == _TURNS or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
         variances = np.maximum(variances * growth, _LEAST)
-        residuals = np.sqrt(minimum.estimate.weights / loss.share)[:, None] * minimum.estimate.at.observations
-        loss = StudentLoss(sightings.share(sightings.correlation(residuals)))
+        root, rng = np.sqrt(weights / loss.share)[:, None], np.random.default_rng(0)
+        steps = np.array([covariance.sample(rng)[problem.observation_columns] for _ in range(_DRAWS)])
+        absorbed = np.sqrt(efficiency) * root * (at.observation_rows @ steps[..., None])[..., 0]
+        loss = StudentLoss(sightings.share(sightings.correlation(root * at.observations, absorbed)))
         state = minimum.estimate.state
         if turn <= _RECKONED:
-            reckoning = reckon(log, nodes_s, state.calibration)
+            reckoning = reckon(log, nodes_s, state.calibration[:WHEELS])
         problem = BearingRangeProblem(measurements(reckoning, variances))
     return RangeSolution(
         nodes_s, reckoned, problem, guess, minimum, variances, loss, covariance, found, iterations,

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.sparse import block_array, csc_matrix, csr_matrix, dia_array, diags_array, identity
 from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve, spsolve_triangular
 
@@ -278,6 +279,7 @@ class Covariance:
             _eliminate(U)
         except SingularMatrixError as error:
             raise undetermined(system) from error
+        self._factor = U
         self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
         algebra.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
 
@@ -287,9 +289,24 @@ class Covariance:
         return self.of(pose_columns(self._layout, np.arange(self._layout.poses)))
 
     @property
+    def calibration(self) -> NDArray[np.float64]:
+        """Standard deviations of the calibration, (C,)."""
+        first, last = self._layout.split, self._layout.landmark_start
+        return np.sqrt(self._corner.diagonal()[: last - first])
+
+    @property
     def landmarks(self) -> Matrix:
         """Covariance of every landmark, (L, 2, 2) m²."""
         return self.of(landmark_columns(self._layout, np.arange(len(self._layout.landmarks))))
+
+    def sample(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """A normally distributed step (n,) with this covariance: x = U⁻¹ z for AᵀA = UᵀU."""
+        U, split = self._factor, self._layout.split
+        z = rng.normal(size=self._layout.columns)
+        z[split:] = solve_triangular(U.corner, z[split:], check_finite=False)
+        z[:split] -= U.border @ z[split:]
+        algebra.solve_backward(U.band, z[:split])
+        return z
 
     def of(self, columns: NDArray[np.int64]) -> Matrix:
         """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""

@@ -11,12 +11,14 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import FREEDOM, InputError, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
+from scanchain.landmarks.association import associated
 from scanchain.landmarks.estimate import (
     Minimum,
     Optimizer,
@@ -27,7 +29,7 @@ from scanchain.landmarks.estimate import (
 )
 from scanchain.landmarks.files import RangeLog, read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, LandmarkData, LinearSystem, Values, linear_system
-from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
+from scanchain.landmarks.ranges import OWN, OWN_UNITS, WHEELS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
 from scanchain.trajectory import write_tum
 
@@ -65,15 +67,18 @@ def of_positions(state: Values, data: LandmarkData) -> Estimate:
 
 
 def against_truth(
-    states: Sequence[Values], nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64], log: RangeLog
+    states: Sequence[Values], nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64] | None, log: RangeLog
 ) -> tuple[list[Estimate], Matrix, Matrix]:
     """Estimates with ATE against motion capture after rigid alignment, which is applied to the landmarks as well.
 
-    nodes_s, landmarks : (K,) times of the poses, (L,) numbers of the landmarks
+    nodes_s, landmarks : (K,) times of the poses, (L,) numbers of the landmarks; None where these are not known and
+        each is compared with the surveyed one nearest to it in the last state
     Also returns the true positions (k, 2) of poses, and (L, 2) of landmarks, NaN for those not surveyed.
     """
     place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
-    surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
+    surveyed = np.full_like(states[0].landmarks, np.nan)
+    if landmarks is not None:
+        surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
     truth, estimates = _trajectory(log.true_s, log.true_poses), list[Estimate]()
     try:
         pairs = [pair(_trajectory(nodes_s, each.poses), truth, gap_s=_WIDEST_GAP_S) for each in states]
@@ -82,6 +87,10 @@ def against_truth(
         why = "no motion capture at these times"
         estimates += [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states]
         return estimates, np.empty((0, 2)), surveyed
+    if landmarks is None and place:
+        T_truth_estimate = lie.flatten(errors[-1].T_reference_estimate)
+        _, nearest = KDTree(log.true_landmarks).query(lie.transform(T_truth_estimate, states[-1].landmarks))
+        surveyed = log.true_landmarks[nearest]
     for state, error in zip(states, errors, strict=True):
         T_truth_estimate = lie.flatten(error.T_reference_estimate)
         landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)
@@ -112,8 +121,8 @@ class Options:
     """Options of a study.
 
     ``methods`` are the linear solvers by name, or "all"; the first one makes the estimate of a file.
-    ``robot`` and ``noise`` are for MRCLAM folders, where the noise is estimated if it is None; ``guess`` and
-    ``optimizer`` are for nonlinear files.
+    ``robot``, ``noise`` and ``ignore_barcodes`` are for MRCLAM folders; the noise is estimated if it is None.
+    ``guess`` and ``optimizer`` are for nonlinear files.
     """
 
     methods: tuple[str, ...]
@@ -122,6 +131,7 @@ class Options:
     noise: OdometryNoise | None
     guess: Literal["odometry", "disturbed", "origin"]
     optimizer: Optimizer
+    ignore_barcodes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,17 +235,26 @@ def study_log(folder: Path, options: Options) -> Study:
     The requested linear solvers are compared on the first step from the initial guess, with the estimated noise;
     ``ESTIMATOR`` makes the estimate.
     """
-    log = read_mrclam(folder, options.robot)
-    solution = solve_range_log(log, options.noise)
+    log = given = read_mrclam(folder, options.robot)
+    if options.ignore_barcodes:
+        log, solution = associated(log, options.noise)
+    else:
+        solution = solve_range_log(log, options.noise)
     begin = working_s()
     at = solution.problem.linearize(solution.guess)
     system = solution.problem.system(at, solution.loss.weight(np.square(at.observations).sum(axis=1)))
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     facts = _facts(log, solution, is_stated=options.noise is not None) | left_out
+    if options.ignore_barcodes:
+        open_ones = counted(len(given.seen_s) - len(log.seen_s), "sighting")
+        facts["association"] = (
+            f"without barcodes: {len(np.unique(log.subjects))} landmarks; {open_ones} of none of them"
+        )
     minimum, nodes_s = solution.minimum, solution.nodes_s
     states, landmarks = (solution.reckoned, minimum.estimate.state), system.pattern.layout.landmarks
-    (before, after), true_poses, surveyed = against_truth(states, nodes_s, landmarks, log)
+    named = None if options.ignore_barcodes else landmarks
+    (before, after), true_poses, surveyed = against_truth(states, nodes_s, named, log)
     return Study(
         log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system,
         build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
@@ -246,15 +265,20 @@ def study_log(folder: Path, options: Options) -> Study:
 def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[str, str]:
     noise, estimate, share = solution.consistency, solution.minimum.estimate, solution.loss.share
     nodes = counted(len(solution.nodes_s), "pose")
-    forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m = solution.sigmas
+    forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m, range_share = solution.sigmas
     wheels = (
         f"{forward_m:.3g} m forward, {sideways_m:.3g} m sideways, {drift_rad:.3g} rad"
         f" after a meter, {turn_rad:.3g} rad after a radian"
     )
-    own = zip(OWN, estimate.state.calibration, OWN_UNITS, strict=True)
-    found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
+    own = [
+        f"{name} {value:+.3f} ± {sigma:.3f}{unit}"
+        for name, value, sigma, unit in zip(
+            OWN, estimate.state.calibration, solution.covariance.calibration, OWN_UNITS, strict=True
+        )
+    ]
+    found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m and {range_share:.2%} (Student's t)"
     downweighted = int(np.count_nonzero(estimate.weights < _DOWNWEIGHTED * share))
-    state, sensor = "stated" if is_stated else "estimated", float(np.mean(noise.sensor / noise.sensor_freedom))
+    state, sensor = "stated" if is_stated else "estimated", noise.sensor / noise.sensor_freedom
     return {
         "observations": (
             f"{len(log.seen_s):,} of {len(estimate.state.landmarks)} landmarks from {nodes}; they count as "
@@ -264,7 +288,8 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[s
             f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
         ),
         "estimate": f"{1e3 * solution.time_s:.0f} ms, {_ended(solution.minimum, solution.iterations)}",
-        "robot": "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own),
+        "robot": f"estimated: {', '.join(own[:WHEELS])}",
+        "sensor": f"estimated: {', '.join(own[WHEELS:])}",
         "odometry noise": f"{state}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
         "sensor noise": f"estimated: {found}; {_verdict(sensor)}",
         "downweighted": (

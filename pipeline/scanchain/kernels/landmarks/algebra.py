@@ -26,12 +26,11 @@ def products(
     w = band.shape[0] - 1
     for r in range(row_start.size - 1):
         for p in range(row_start[r], row_start[r + 1]):
-            i = columns[p]
-            g[i] += values[p] * b[r]
-            for q in range(row_start[r], row_start[r + 1]):
-                j, product = columns[q], values[p] * values[q]
-                if j < i:
-                    continue
+            if values[p] == 0.0:
+                continue
+            g[columns[p]] += values[p] * b[r]
+            for q in range(p, row_start[r + 1]):
+                i, j, product = min(columns[p], columns[q]), max(columns[p], columns[q]), values[p] * values[q]
                 if j < split:
                     band[w + i - j, j] += product
                 elif i < split:

@@ -12,23 +12,28 @@ _NOWHERE_M = 1e-9  # distance to the pose below which a landmark has no bearing
 
 @njit()
 def bearing_range(
-    poses: _Array, landmarks: _Array, observed: _Index, measured: _Array, whitening: _Array, residuals: _Array,
-    jacobians: _Array,
+    poses: _Array, landmarks: _Array, observed: _Index, measured: _Array, whitening: _Array, own: _Array,
+    sensing: _Index, residuals: _Array, jacobians: _Array,
 ) -> None:  # fmt: skip
     """Fill W r and W J of every observation, residual (measured from predicted) and Jacobian, WᵀW = Σ⁻¹.
 
-        δ = l − t,  q = ‖δ‖,  r = [wrap(atan2(δ_y, δ_x) − θ − bearing), q − range]
-        ∂r/∂t = [δ_y/q², −δ_x/q²; −δ_x/q, −δ_y/q],  ∂r/∂θ = [−1; 0],  ∂r/∂l = −∂r/∂t
+        δ = l − t,  q = ‖δ‖,  β = wrap(atan2(δ_y, δ_x) − θ − bearing) + bearing
+        ∂(β, q)/∂t = [δ_y/q², −δ_x/q²; −δ_x/q, −δ_y/q],  ∂(β, q)/∂θ = [−1; 0],  ∂(β, q)/∂l = −∂(β, q)/∂t
+        r = [β (1 + c₄) + c₃ + c₅ sin(β)/q − bearing, q (1 + c₀ − c₁ (1 − cos β)) + c₂ − c₅ cos(β) − range]
 
-    A landmark at the position of the pose has no bearing; it is assumed in the measured direction, and only the
-    range has a residual.
+    with the systematic errors c of the sensor: of the ranges a scale, 1 if they are depths along the optical axis
+    and 0 if they are distances, an offset; of the bearings an offset and a scale; the distance by which the sensor
+    is ahead of the pose. A landmark at the position of the pose has no bearing; it is assumed in the measured
+    direction, and only the range has a residual.
 
     poses : (K, 2) x, y, with heading 0, or (K, 3) x, y, θ; landmarks (L, 2); m, rad
-    observed (N, 2) pose and landmark, measured (N, 2) bearing rad, range m, whitening (2, 2) W
-    residuals (N, 2), jacobians (N, 2, pose + 2) : filled, columns pose first
+    observed (N, 2) pose and landmark, measured (N, 2) bearing rad, range m, whitening (N, 2, 2) W
+    own (C,), sensing (N, 6) : calibration, and where each observation has c in it; (N, 0) where c is zero
+    residuals (N, 2), jacobians (N, 2, pose + 2 + 6) : filled, columns pose first
     """
-    p = poses.shape[1]
-    J = np.zeros((2, p + 2))
+    p, unknown = poses.shape[1], sensing.shape[1]
+    c = np.zeros(6)
+    J = np.zeros((2, p + 2 + unknown))
     for k in range(observed.shape[0]):
         pose, landmark, bearing_rad = poses[observed[k, 0]], landmarks[observed[k, 1]], measured[k, 0]
         heading = pose[2] if p == 3 else 0.0
@@ -47,10 +52,26 @@ def bearing_range(
             J[a, 0], J[a, 1] = -J[a, p], -J[a, p + 1]
         if p == 3:
             J[0, 2] = -1.0 if q > _NOWHERE_M else 0.0
+            J[1, 2] = 0.0
+        if unknown and q > _NOWHERE_M:
+            for a in range(unknown):
+                c[a] = own[sensing[k, a]]
+            angle = off_rad + bearing_rad
+            sine, cosine = np.sin(angle), np.cos(angle)
+            off_rad += c[4] * angle + c[3] + c[5] * sine / q
+            off_m += q * (c[0] - c[1] * (1.0 - cosine)) + c[2] - c[5] * cosine
+            along, across = c[0] - c[1] * (1.0 - cosine), (c[5] - c[1] * q) * sine
+            turned, lifted = c[4] + c[5] * cosine / q, -c[5] * sine / (q * q)
+            for a in range(p + 2):
+                b, d = J[0, a], J[1, a]
+                J[0, a] += turned * b + lifted * d
+                J[1, a] += across * b + along * d
+            J[0, p + 2 :] = 0.0, 0.0, 0.0, 1.0, angle, sine / q
+            J[1, p + 2 :] = q, -q * (1.0 - cosine), 1.0, 0.0, 0.0, -cosine
         for a in range(2):
-            residuals[k, a] = whitening[a, 0] * off_rad + whitening[a, 1] * off_m
-            for c in range(p + 2):
-                jacobians[k, a, c] = whitening[a, 0] * J[0, c] + whitening[a, 1] * J[1, c]
+            residuals[k, a] = whitening[k, a, 0] * off_rad + whitening[k, a, 1] * off_m
+            for b in range(p + 2 + unknown):
+                jacobians[k, a, b] = whitening[k, a, 0] * J[0, b] + whitening[k, a, 1] * J[1, b]
 
 
 @njit()
@@ -83,6 +104,19 @@ def odometry(poses: _Array, moved: _Array, whitening: _Array, residuals: _Array,
                 residuals[k, a] += whitening[k, a, b] * r[b]
                 for d in range(6):
                     jacobians[k, a, d] += whitening[k, a, b] * J[b, d]
+
+
+@njit()
+def lagged_products(first: _Index, second: _Index, lag: _Index, errors: _Array, sums: _Array) -> None:
+    """Add the products of the errors of every pair to the sum of its lag.
+
+    first, second, lag (P,) : indices of the errors, and of the sum; errors (N, k), sums (lags,)
+    """
+    for p in range(first.size):
+        total = 0.0
+        for a in range(errors.shape[1]):
+            total += errors[first[p], a] * errors[second[p], a]
+        sums[lag[p]] += total
 
 
 @njit()
