@@ -121,7 +121,7 @@ def _gap(problem: GraphProblem, poses: Matrix, weights: Vector, chi2: float) -> 
             continue
         relaxation = Relaxation(problem, *dual_matrix(problem, minorants, kept), centered[free, :-1, -1], chi2)
         bound = relaxation.dual(relaxation.estimate)
-        lost = chi2 - float(minorants.value[kept].sum()) + relaxation.value(relaxation.estimate)
+        lost = chi2 - float(minorants.value[kept].sum())
         if not touching and not bound.is_minimum:
             X, bound = relaxation.minimize(relaxation.estimate, bound)
             G, positions = relaxation.rounded(X)

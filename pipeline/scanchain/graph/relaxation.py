@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from scanchain.data import Matrix
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
@@ -40,37 +42,39 @@ class DualBound:
 
 
 class Relaxation:
-    """F(X) = ⟨S, X Xᵀ⟩ + 2 ⟨B, X⟩, where X (N, r) holds r coordinates of every axis of every G and of every t.
+    """F(X) = ⟨S, Δ Δᵀ⟩ + 2 ⟨R, Δ⟩, where X (N, r) holds r coordinates of every axis of every G and of every t.
 
-    The axes of each G stay orthonormal. For r = d this is the problem itself, for more columns its semidefinite
-    relaxation (Burer & Monteiro 2003; Boumal et al. 2016; Rosen et al. 2019). Fixed poses are part of B.
+    Δ is X minus the estimate, at which every G is I; the axes of each G stay orthonormal. For r = d this is the
+    problem itself, for more columns its semidefinite relaxation (Burer & Monteiro 2003; Boumal et al. 2016; Rosen
+    et al. 2019). Fixed poses stay where they are.
     """
 
     def __init__(self, problem: GraphProblem, S: Matrix, residual: Matrix, positions: Matrix, chi2: float) -> None:
-        """At the estimate every G is I.
-
-        S : (B, d+1, d+1) as blocks of the problem's pattern
-        residual : (n, d+1, d) S X + B at the estimate
-        positions : (n, d) of the estimate
-        chi2 : of the estimate
-        """
+        """Of S (B, d+1, d+1), as blocks of the problem's pattern, R (n, d+1, d), positions (n, d) and χ²."""
         self._count, self._d = len(problem.free), positions.shape[1]
         self._has_axes = ~problem.is_point[problem.free]
-        pattern = BlockPattern(np.where(self._has_axes, self._d + 1, 1), problem.pattern.pairs)
-        self._packing = Packing(pattern, self._d + 1, at_end=True)
-        self._factor = SparseCholesky(pattern, problem.cholesky.analysis)
-        self._blocks, self._S = S, pattern.matrix(self._packing.values(S))
+        self._pattern = BlockPattern(np.where(self._has_axes, self._d + 1, 1), problem.pattern.pairs)
+        self._packing = Packing(self._pattern, self._d + 1, at_end=True)
+        self._factor = SparseCholesky(self._pattern, problem.cholesky.analysis)
+        self._blocks, self._residual = S, self._packing.packed(residual)
         self._chi2, self._left, self._per_axis = chi2, _PRODUCTS, chi2 / (self._d * self._count)
         self._unit = np.broadcast_to(np.eye(self._d), (self._count, self._d, self._d))
         self.estimate = self._packing.packed(np.concatenate([self._unit, positions[:, None]], axis=1))
-        self._B = self._packing.packed(residual) - self._S @ self.estimate
+
+    @cached_property
+    def _S(self) -> csr_matrix:
+        return self._pattern.matrix(self._packing.values(self._blocks))
 
     def value(self, X: Matrix) -> float:
-        """F(X)."""
-        return float((X * (self._S @ X)).sum() + 2.0 * (self._B * X[:, : self._d]).sum())
+        """F(X), zero at the estimate."""
+        if X is self.estimate:
+            return 0.0
+        difference = self._difference(X)
+        linear = (self._residual * difference[:, : self._d]).sum()
+        return float((difference * (self._S @ difference)).sum() + 2.0 * linear)
 
     def dual(self, X: Matrix) -> DualBound:
-        """F ≥ F(X) − tr(rᵀ(S − Λ + μ)⁻¹ r), with r = (S − Λ + μ) X + B, for the least shift μ tried.
+        """F ≥ F(X) − tr(rᵀ(S − Λ + μ)⁻¹ r), with r = S Δ + R − (Λ − μ) X, for the least shift μ tried.
 
         Positive definite means that the Cholesky factorization succeeds; the factor is retained.
         """
@@ -187,10 +191,17 @@ class Relaxation:
         G[self._has_axes] = U @ V
         return G, flat[:, d]
 
+    def _difference(self, X: Matrix) -> Matrix:
+        result = X.copy()
+        result[:, : self._d] -= self.estimate
+        return result
+
     def _gradient(self, X: Matrix) -> Matrix:
-        """S X + B, half of the gradient of F."""
-        result = self._S @ X
-        result[:, : self._d] += self._B
+        """S Δ + R, half of the gradient of F."""
+        if X is self.estimate:
+            return self._residual.copy()
+        result = self._S @ self._difference(X)
+        result[:, : self._d] += self._residual
         return result
 
     def _multipliers(self, gradient: Matrix, X: Matrix) -> Matrix:
