@@ -3,13 +3,16 @@
 import csv
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from scanchain.landmarks.ranges import solve_range_log
 from scanchain.landmarks.solvers import ESTIMATOR, METHODS
 from scanchain.trajectory import read_tum
 from tests.support.browser import look
+from tests.support.mrclam import World, write_mrclam
 from tests.support.scenes import shared_data
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
@@ -131,3 +134,24 @@ def test_an_mrclam_folder_gives_a_stamped_trajectory(call, tmp_path):
     assert code == 0 and "407 of other robots" in output
     trajectory = read_tum(tmp_path / "out" / "utias_mrclam6_robot_1.tum")
     assert len(trajectory) == 1012 and trajectory.stamps_ns[0] == 1248444189_599_000_000
+
+
+@pytest.mark.parametrize("is_wrong", [True, False])
+def test_landmarks_that_are_missed_on_most_visits_are_named_and_the_exit_code_is_1(
+    call, tmp_path, monkeypatch, is_wrong
+):
+    def with_barcodes(log, noise):
+        """A solution in which the landmark seen most often has another number at first, if it is to be wrong."""
+        subjects = log.subjects.copy()
+        own = np.flatnonzero(subjects == np.bincount(subjects).argmax())
+        subjects[own[: len(own) // 5]] = 99 if is_wrong else subjects[own[0]]
+        part = replace(log, subjects=subjects)
+        return part, solve_range_log(part, noise)
+
+    monkeypatch.setattr("scanchain.landmarks.study.associated", with_barcodes)
+    write_mrclam(tmp_path / "world", World(51, duration_s=600.0))
+    code, output, _ = call("landmarks", tmp_path / "world", "--ignore-barcodes", "--out", tmp_path / "out")
+    (problem,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["problems"]
+    assert code == is_wrong and problem["converged"] is not is_wrong
+    assert problem["contradicted"] == ([99] if is_wrong else [])
+    assert ("1 landmark (99) not seen on most visits" in " ".join(output.split())) == is_wrong

@@ -1,10 +1,12 @@
 """Simulated MRCLAM folders: what the estimate makes of them, and of its own errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scanchain.errors import InputError
-from scanchain.landmarks.association import associated
+from scanchain.landmarks.association import _filtered, _settled, associated, visits
 from scanchain.landmarks.files import read_mrclam
 from scanchain.landmarks.ranges import OWN, WHEELS, solve_range_log
 from tests.support.mrclam import World, write_mrclam
@@ -62,6 +64,32 @@ def test_without_barcodes_the_landmarks_and_their_number_are_found(tmp_path, wor
     assert pure > (0.93 if "wrong" in world else 0.97) * len(true) and len(true) > 0.95 * len(log.seen_s)
     landmarks = np.full((len(solution.problem.measurements.landmarks), 2), np.nan)
     assert nees(solution, truth_at(log, solution.nodes_s), landmarks, 0.005).ate_m < 0.15
+
+
+def test_a_log_that_the_filter_loses_with_the_priors_is_found_with_the_errors_of_short_tracks(tmp_path):
+    write_mrclam(tmp_path / "world", World(5, duration_s=450.0))
+    log = read_mrclam(tmp_path / "world", 1)
+    lost, found = _settled(log, None, _filtered(log, None, None)), associated(log, None)
+    (_, missed), (_, missed_then) = visits(*lost), visits(*found)
+    assert missed.sum() > 20 and missed_then.sum() == 0
+    for (_, solution), is_lost in ((lost, True), (found, False)):
+        landmarks = np.full((len(solution.problem.measurements.landmarks), 2), np.nan)
+        assert (nees(solution, truth_at(log, solution.nodes_s), landmarks, 0.005).ate_m > 0.2) == is_lost
+
+
+@pytest.mark.parametrize("world", [{}, {"landmarks": 6}, {"noise": 2.0}])
+def test_a_landmark_is_contradicted_where_it_has_another_number_later_and_only_there(tmp_path, world):
+    log, solution, _ = solved(tmp_path, World(51, duration_s=600.0, **world))
+    seen, missed = visits(log, solution)
+    assert not np.any(missed > seen) and missed.sum() <= 0.05 * seen.sum()
+    often = np.argmax(seen)
+    own = np.flatnonzero(log.subjects == solution.problem.measurements.landmarks[often])
+    twice = log.subjects.copy()
+    twice[own[: len(own) // 5]] = 99
+    log = replace(log, subjects=twice)
+    solution = solve_range_log(log, None)
+    seen, missed = visits(log, solution)
+    assert solution.problem.measurements.landmarks[missed > seen].tolist() == [99]
 
 
 def test_a_log_in_which_nothing_is_recognized_again_is_refused_in_one_line(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations, permutations
 
@@ -17,7 +18,7 @@ from scanchain.errors import InputError
 from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.estimate import chain
 from scanchain.landmarks.files import RangeLog
-from scanchain.landmarks.problem import landmark_columns
+from scanchain.landmarks.problem import Values, landmark_columns
 from scanchain.landmarks.ranges import (
     OWN,
     PRIOR_SIGMA,
@@ -37,7 +38,10 @@ _CANDIDATES = 4  # largest number of landmarks that a sighting may be of
 _CLEAR = 6.0  # least difference of χ² from the second-best hypothesis
 _FEWEST = 4  # least number of sightings of a landmark
 _CLOSE_M = 0.08  # distance of sightings of one new landmark
-_ROUNDS = 7  # largest number of batch estimates
+_TRACKED_S = 5.0  # longest time out of sight within a track
+_RIM = 0.05  # share of the sightings at either end of bearings and ranges
+_VISIT = 5  # shortest visit in instants, missed by chance in 3 % if half of the sightings drop out
+_ROUNDS = 8  # largest number of batch estimates
 _FIRST = 3 + len(OWN)  # unknowns of the filter before those of the landmarks
 
 
@@ -47,18 +51,62 @@ def associated(log: RangeLog, noise: OdometryNoise | None) -> tuple[RangeLog, Ra
     The filter decides on the sightings of an instant jointly (Neira & Tardós 2001): as many compatible ones as
     possible, then the least χ²; those on which the second-best hypothesis is almost as good are left open. Every
     sighting is then associated again with landmarks of the batch estimate, or with a new one, and landmarks that
-    are the same are merged, until nothing changes or a few times. Raises InputError if no landmark is seen again.
+    are the same are merged, until nothing changes or a few times. If landmarks are missed where they should be in
+    view, the filter begins again with better systematic errors: those of short tracks, on which no landmark is
+    recognized again, then those of the estimate; the one with the least share of missed visits is returned. Raises
+    InputError if no landmark is seen again.
     """
-    nodes_s, subjects = np.unique(log.seen_s), _filtered(log, noise or OdometryNoise())
+    subjects = _filtered(log, noise, None)
+    best = _settled(log, noise, subjects)
+    for is_local in (True, False):
+        if _missed_share(best) > 0.0:
+            with suppress(InputError):
+                start = solve_range_log(_with(log, _tracks(log, subjects)), noise) if is_local else best[1]
+                best = min(best, _settled(log, noise, _filtered(log, noise, start)), key=_missed_share)
+    return best
+
+
+def visits(part: RangeLog, solution: RangeSolution) -> NDArray[np.int64]:
+    """Numbers of visits on which each landmark is seen, and on which it is missed, (2, L).
+
+    A visit is a run of instants at which a landmark is well within the bearings and ranges of the log's sightings.
+    """
+    state, (node, landmark) = solution.minimum.estimate.state, solution.problem.measurements.observed.T
+    predicted, _ = _residuals(state, np.arange(len(state.poses)), np.zeros((len(state.poses), 2)))
+    low, high = np.quantile(part.measured, (_RIM, 1.0 - _RIM), axis=0)
+    in_view = ((predicted > low) & (predicted < high)).all(axis=2).T
+    in_view = np.pad(in_view, ((0, 0), (1, 1)))  # a visit ends where the log does
+    seen = np.zeros_like(in_view)
+    seen[landmark, node + 1] = True
+    begin, end = np.flatnonzero(np.diff(in_view.ravel(), prepend=False)).reshape(-1, 2).T
+    before = np.append(0, np.cumsum(seen))
+    of, is_long, is_seen = begin // in_view.shape[1], end - begin >= _VISIT, before[end] > before[begin]
+    return np.array([np.bincount(of[is_long & each], minlength=len(seen)) for each in (is_seen, ~is_seen)])
+
+
+def _missed_share(found: tuple[RangeLog, RangeSolution]) -> float:
+    """Share of the visits on which the landmark is missed."""
+    seen, missed = visits(*found).sum(axis=1)
+    return float(missed / max(seen + missed, 1))
+
+
+def _settled(
+    log: RangeLog, noise: OdometryNoise | None, subjects: NDArray[np.int64], rounds: int = _ROUNDS
+) -> tuple[RangeLog, RangeSolution]:
+    """The log and its solution after all sightings are associated with the batch estimate, again and again."""
     part = _with(log, subjects)
-    solution = solve_range_log(part, noise, nodes_s)
-    for _ in range(_ROUNDS):
-        before, subjects = subjects, _reassociated(log, part, solution)
-        if np.array_equal(before, subjects):
-            break
-        part = _with(log, subjects)
-        solution = solve_range_log(part, noise, nodes_s)
-    return part, solution
+    solution = solve_range_log(part, noise, np.unique(log.seen_s))
+    after = _reassociated(log, part, solution)
+    if rounds == 1 or np.array_equal(after, subjects):
+        return part, solution
+    return _settled(log, noise, after, rounds - 1)
+
+
+def _tracks(log: RangeLog, subjects: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Landmarks (N,), each another one after it was out of sight, so that none is recognized again; 0 stays."""
+    order = np.lexsort((log.seen_s, subjects))
+    is_new = (np.diff(subjects[order]) != 0) | (np.diff(log.seen_s[order]) > _TRACKED_S)
+    return np.where(subjects > 0, np.cumsum(np.append(1, is_new))[np.argsort(order)], 0)
 
 
 def _with(log: RangeLog, subjects: NDArray[np.int64]) -> RangeLog:
@@ -76,9 +124,9 @@ def _with(log: RangeLog, subjects: NDArray[np.int64]) -> RangeLog:
 class _Filter:
     """Pose, systematic errors and landmarks, x (n,) with covariance P."""
 
-    def __init__(self) -> None:
-        self.x, self.P = np.zeros(_FIRST), np.zeros((_FIRST, _FIRST))
-        self.P[range(3, _FIRST), range(3, _FIRST)] = PRIOR_SIGMA**2
+    def __init__(self, own: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
+        """Begin with these systematic errors (11,) and their standard deviations."""
+        self.x, self.P = np.append(np.zeros(3), own), np.diag(np.append(np.zeros(3), sigma) ** 2)
 
     def predict(self, motion: Matrix, slope: Matrix, covariance: Matrix) -> None:
         """Move by a motion (3,) whose derivative by the wheels' errors is slope (3, 5)."""
@@ -95,25 +143,20 @@ class _Filter:
         """Add the landmark of a sighting, whose bearing and range determine it."""
         angle = self.x[2] + measured[0]
         self.x = np.append(self.x, self.x[:2] + measured[1] * np.array([np.cos(angle), np.sin(angle)]))
-        n = len(self.x) - 2
-        _, H = self.innovations(measured[None], np.array([(n - _FIRST) // 2]))
-        inverse, rest = np.linalg.inv(H[0][:, n:]), H[0][:, :n]
+        rest, own = np.split(self.innovations(measured[None])[1][0, -1], [len(self.x) - 2], axis=1)
+        inverse = np.linalg.inv(own)
         cross = -inverse @ rest @ self.P
-        own = inverse @ (rest @ self.P @ rest.T + R) @ inverse.T
-        self.P = np.block([[self.P, cross.T], [cross, own]])
+        corner = inverse @ (rest @ self.P @ rest.T + R) @ inverse.T
+        self.P = np.block([[self.P, cross.T], [cross, corner]])
 
-    def innovations(self, measured: Matrix, landmarks: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
-        """Residuals r (N, 2), predicted from measured, and Jacobians H (N, 2, n), of these landmarks (N,)."""
-        count, points = len(landmarks), self.x[_FIRST:].reshape(-1, 2)
-        r, J, H = np.empty((count, 2)), np.empty((count, 2, 11)), np.zeros((count, 2, len(self.x)))
-        sensing = np.tile(np.arange(WHEELS, len(OWN)), (count, 1))
-        factors.bearing_range(
-            self.x[None, :3], points, np.stack([np.zeros_like(landmarks), landmarks], axis=1), measured,
-            np.tile(np.eye(2), (count, 1, 1)), self.x[3:_FIRST], sensing, r, J,
-        )  # fmt: skip
-        at = _FIRST + 2 * landmarks[:, None] + np.arange(2)
-        H[:, :, :3], H[:, :, 3 + WHEELS : _FIRST] = J[..., :3], J[..., 5:]
-        np.put_along_axis(H, at[:, None].repeat(2, axis=1), J[..., 3:5], axis=2)
+    def innovations(self, measured: Matrix) -> tuple[Matrix, Matrix]:
+        """Residuals r (N, L, 2), predicted from measured, and Jacobians H (N, L, 2, n), of every landmark."""
+        state = Values(self.x[None, :3], self.x[_FIRST:].reshape(-1, 2), self.x[3:_FIRST])
+        r, J = _residuals(state, np.zeros(len(measured), np.int64), measured)
+        H = np.zeros((*r.shape, len(self.x)))
+        H[..., :3], H[..., 3 + WHEELS : _FIRST] = J[..., :3], J[..., 5:]
+        for k, first in enumerate(range(_FIRST, len(self.x), 2)):
+            H[:, k, :, first : first + 2] = J[:, k, :, 3:5]
         return r, H
 
     def update(self, r: NDArray[np.float64], H: Matrix, R: Matrix) -> None:
@@ -124,25 +167,41 @@ class _Filter:
         self.P = 0.5 * (self.P + self.P.T)
 
 
-def _filtered(log: RangeLog, noise: OdometryNoise) -> NDArray[np.int64]:
-    """Landmark of every sighting by the filter, (N,); 0 where it is left open."""
+def _residuals(state: Values, nodes: NDArray[np.int64], measured: Matrix) -> tuple[Matrix, Matrix]:
+    """Residuals (N, L, 2), predicted from measured, of all landmarks at nodes (N,); Jacobians (N, L, 2, 11)."""
+    shape = len(nodes), len(state.landmarks)
+    observed = np.stack([np.repeat(nodes, shape[1]), np.tile(np.arange(shape[1]), shape[0])], axis=1)
+    r, J = np.empty((len(observed), 2)), np.empty((len(observed), 2, 11))
+    factors.bearing_range(
+        state.poses, state.landmarks, observed, np.repeat(measured, shape[1], axis=0),
+        np.tile(np.eye(2), (len(observed), 1, 1)), state.calibration,
+        np.tile(np.arange(WHEELS, len(OWN)), (len(observed), 1)), r, J,
+    )  # fmt: skip
+    return r.reshape(*shape, 2), J.reshape(*shape, 2, 11)
+
+
+def _filtered(log: RangeLog, noise: OdometryNoise | None, start: RangeSolution | None) -> NDArray[np.int64]:
+    """Landmark of every sighting by the filter, (N,); 0 where it is left open.
+
+    start : solution with the systematic errors and the noise of the sensor to begin with; None for their priors
+    """
+    own, sigma, sensor = np.zeros(len(OWN)), PRIOR_SIGMA, SENSOR
+    if start is not None:
+        own, sensor = start.minimum.estimate.state.calibration, np.minimum(start.variances[4:], SENSOR)
+        sigma = np.minimum(_INFLATION * start.covariance.calibration, PRIOR_SIGMA)
     nodes_s, node = np.unique(log.seen_s, return_inverse=True)
-    reckoning, now = reckon(log, nodes_s, np.zeros(WHEELS)), _Filter()
-    covariance, variances = (
-        reckoning.covariance(noise.densities),
-        _INFLATION * SENSOR @ units_of_noise(log.measured),
-    )
+    reckoning, now = reckon(log, nodes_s, own[:WHEELS]), _Filter(own, sigma)
+    motion = reckoning.motion - reckoning.slope @ own[:WHEELS]  # without these errors, as linearized there
+    covariance = reckoning.covariance((noise or OdometryNoise()).densities)
+    variances = _INFLATION * sensor @ units_of_noise(log.measured)
     subjects = np.zeros(len(node), np.int64)
     for k, seen in enumerate(np.split(np.arange(len(node)), np.flatnonzero(np.diff(node)) + 1)):
         if k:
-            now.predict(reckoning.motion[k - 1], reckoning.slope[k - 1], covariance[k - 1])
-        known = (len(now.x) - _FIRST) // 2
-        r, H = now.innovations(log.measured[np.repeat(seen, known)], np.tile(np.arange(known), len(seen)))
-        r, H, R = r.reshape(len(seen), known, 2), H.reshape(len(seen), known, 2, len(now.x)), variances[seen]
-        pairs = np.ndindex(len(seen), known)
-        alone = np.reshape(
-            [_chi2(now.P, r[i, j][None], H[i, j][None], R[[i]]) for i, j in pairs], (len(seen), known)
-        )
+            now.predict(motion[k - 1], reckoning.slope[k - 1], covariance[k - 1])
+        r, H = now.innovations(log.measured[seen])
+        R, known = variances[seen], r.shape[1]
+        S = H @ now.P @ np.swapaxes(H, -1, -2) + R[:, None, :, None] * np.eye(2)
+        alone = (r[..., None, :] @ np.linalg.solve(S, r[..., None]))[..., 0, 0]
         found = sorted(_hypotheses(now.P, r, H, R, alone), key=lambda each: (-np.count_nonzero(each[0]), each[1]))
         chosen = np.array(found[0][0])
         for other, chi2 in found[1:]:
@@ -193,16 +252,9 @@ def _reassociated(log: RangeLog, part: RangeLog, solution: RangeSolution) -> NDA
     """
     state, names = solution.minimum.estimate.state, solution.problem.measurements.landmarks
     node = np.searchsorted(solution.nodes_s, log.seen_s)
-    count, known = len(log.seen_s), len(names)
-    r, J = np.empty((count * known, 2)), np.empty((count * known, 2, 11))
-    observed = np.stack([np.repeat(node, known), np.tile(np.arange(known), count)], axis=1)
-    factors.bearing_range(
-        state.poses, state.landmarks, observed, np.repeat(log.measured, known, axis=0),
-        np.tile(np.eye(2), (len(observed), 1, 1)), state.calibration,
-        np.tile(np.arange(WHEELS, len(OWN)), (len(observed), 1)), r, J,
-    )  # fmt: skip
+    r, _ = _residuals(state, node, log.measured)
     variances = np.minimum(solution.variances[4:], SENSOR) @ units_of_noise(log.measured)
-    chi2 = (r.reshape(count, known, 2) ** 2 / variances[:, None]).sum(axis=2)
+    chi2 = (r**2 / variances[:, None]).sum(axis=2)
     result, alone = _merged(part, solution)[chi2.argmin(axis=1)], np.flatnonzero(chi2.min(axis=1) > _NEW)
     bearing, m = log.measured[alone].T
     c = state.calibration[WHEELS:]

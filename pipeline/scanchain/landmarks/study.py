@@ -18,7 +18,7 @@ from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import FREEDOM, InputError, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
-from scanchain.landmarks.association import associated
+from scanchain.landmarks.association import associated, visits
 from scanchain.landmarks.estimate import (
     Minimum,
     Optimizer,
@@ -142,7 +142,9 @@ class Study:
     covariance : after optimization
     true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown
     system, build_s : A x = b as the methods solved it, and the time to assemble it
+    converged : False also if landmarks are contradicted
     trajectory : the poses after optimization with their stamps; None for a file, which has no stamps
+    contradicted : landmarks found without barcodes that are missed on more visits than seen
     """
 
     name: str
@@ -157,6 +159,7 @@ class Study:
     build_s: float
     methods: tuple[MethodResult, ...]
     trajectory: Trajectory | None = None
+    contradicted: tuple[int, ...] = ()
 
 
 def study_file(data: LandmarkData, options: Options) -> Study:
@@ -246,19 +249,22 @@ def study_log(folder: Path, options: Options) -> Study:
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     facts = _facts(log, solution, is_stated=options.noise is not None) | left_out
-    if options.ignore_barcodes:
-        open_ones = counted(len(given.seen_s) - len(log.seen_s), "sighting")
-        facts["association"] = (
-            f"without barcodes: {len(np.unique(log.subjects))} landmarks; {open_ones} of none of them"
-        )
-    minimum, nodes_s = solution.minimum, solution.nodes_s
+    minimum, nodes_s, contradicted = solution.minimum, solution.nodes_s, tuple[int, ...]()
     states, landmarks = (solution.reckoned, minimum.estimate.state), system.pattern.layout.landmarks
+    if options.ignore_barcodes:
+        seen, missed = visits(log, solution)
+        contradicted = tuple(landmarks[missed > seen].tolist())
+        left = counted(len(given.seen_s) - len(log.seen_s), "sighting")
+        facts["association"] = f"without barcodes: {len(landmarks)} landmarks; {left} of none of them"
+    if contradicted:
+        which = f"{counted(len(contradicted), 'landmark')} ({', '.join(map(str, contradicted))})"
+        facts["CONTRADICTED"] = f"{which} not seen on most visits: duplicates, or poses that are wrong"
     named = None if options.ignore_barcodes else landmarks
     (before, after), true_poses, surveyed = against_truth(states, nodes_s, named, log)
     return Study(
-        log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system,
-        build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
-        _trajectory(nodes_s, minimum.estimate.state.poses),
+        log.name, facts, before, after, minimum.converged and not contradicted, solution.covariance, true_poses,
+        surveyed, system, build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
+        _trajectory(nodes_s, minimum.estimate.state.poses), contradicted,
     )  # fmt: skip
 
 
@@ -364,6 +370,7 @@ def tree_of(study: Study) -> dict[str, object]:
         "name": study.name,
         "facts": study.facts,
         "converged": study.converged,
+        "contradicted": study.contradicted,
         "before": _figures(study.before),
         "after": _figures(study.after),
         "A": {"rows": rows, "columns": columns, "entries": len(study.system.values), "build_s": study.build_s},
