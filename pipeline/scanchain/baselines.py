@@ -1,4 +1,4 @@
-"""Third-party odometries by name: KISS-ICP, GenZ-ICP, RKO-LIO, small_gicp, and Open3D's ICP from scan to scan.
+"""Third-party methods by name: KISS-ICP, KISS-SLAM, GenZ-ICP, RKO-LIO, small_gicp, Open3D's ICP from scan to scan.
 
 A new one is a class, as ``Baseline`` describes it, and a line in ``BASELINES``. Outside of the package,
 ``scanchain compare --methods my_module:MyClass`` runs a class of yours, given its table of --config as keywords.
@@ -20,14 +20,15 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Count, NonNegative, Positive
-from scanchain.data import Inertial, Pose, RawPoints
+from scanchain.data import Inertial, Matrix, Pose, RawPoints
 from scanchain.errors import MissingExtraError, NotApplicableError
 
 
 class Baseline(Protocol):
     """A third-party odometry method, run on the same scans as ours.
 
-    One with ``add_inertial`` is given the ``Inertial`` of a scan before the scan, on logs that have an IMU.
+    One with ``add_inertial`` is given the ``Inertial`` of a scan before the scan, on logs that have an IMU. What
+    ``final_poses`` returns, where there is one, after the last scan, (N, 4, 4), is the trajectory then.
     """
 
     @property
@@ -119,12 +120,12 @@ class InPlane:
 DISTORTED = 2  # first scans that KISS-ICP does not deskew, for lack of a previous motion
 
 
-def _imported(module: str, package: str) -> Any:
+def _imported(module: str, package: str, extra: str = "baselines") -> Any:
     """A module of a package that only an extra installs."""
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise MissingExtraError(package, "baselines") from None
+        raise MissingExtraError(package, extra) from None
 
 
 class KissSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -148,27 +149,83 @@ class KissIcp:
     def __init__(self, settings: KissSettings = KISS) -> None:
         library = _imported("kiss_icp.kiss_icp", "kiss-icp")
         config = _imported("kiss_icp.config.parser", "kiss-icp").load_config(None)
-        config.data.min_range, config.data.max_range = settings.min_range_m, settings.max_range_m
-        config.mapping.voxel_size = settings.voxel_size_m
-        config.mapping.max_points_per_voxel = settings.max_points_per_voxel
-        config.registration.max_num_iterations = settings.max_iterations
-        config.registration.max_num_threads = settings.threads
-        self.description = (
-            f"KISS-ICP, point-to-point scan to map, {settings.min_range_m:g} to {settings.max_range_m:g} m, "
-            f"voxels of {settings.voxel_size_m:g} m, {settings.threads or 'all'} threads, its own deskewing where "
-            "the log has times"
-        )
+        self.description = f"KISS-ICP, {_configured_kiss(config, config.data, settings)}"
         self.odometry = library.KissICP(config)
         self.at_stamp = AtStamp()
-        self.scans = 0
+        self.held = list[tuple[int, float]]()  # stamp of each scan, and seconds from it to the pose
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """Register one scan; KISS-ICP's pose holds at the last point once it deskews, ours at the scan's stamp."""
         frame, times = finite(points, times_s)
+        T_theirs_held = self._registered(frame, times)
+        is_distorted = len(self.held) < DISTORTED or not len(times)
+        self.held.append((stamp_ns, middle(times) if is_distorted else float(times.max())))
+        return self.at_stamp.move(T_theirs_held, *self.held[-1])
+
+    def _registered(self, frame: NDArray[np.float64], times: NDArray[np.float64]) -> Pose:
         self.odometry.register_frame(frame, times)
-        self.scans += 1
-        held_s = middle(times) if self.scans <= DISTORTED or not len(times) else float(times.max())
-        return self.at_stamp.move(np.array(self.odometry.last_pose, np.float64), stamp_ns, held_s)
+        return np.array(self.odometry.last_pose, np.float64)
+
+
+def _configured_kiss(odometry: Any, data: Any, settings: KissSettings) -> str:
+    """The description of these settings, which are written into KISS-ICP's configuration."""
+    data.min_range, data.max_range = settings.min_range_m, settings.max_range_m
+    odometry.mapping.voxel_size = settings.voxel_size_m
+    odometry.mapping.max_points_per_voxel = settings.max_points_per_voxel
+    odometry.registration.max_num_iterations = settings.max_iterations
+    odometry.registration.max_num_threads = settings.threads
+    return (
+        f"point-to-point scan to map, {settings.min_range_m:g} to {settings.max_range_m:g} m, "
+        f"voxels of {settings.voxel_size_m:g} m, {settings.threads or 'all'} threads, its own deskewing where "
+        "the log has times"
+    )
+
+
+class KissSlamSettings(KissSettings, frozen=True, forbid_unknown_fields=True):
+    """Its defaults; a local map ends so far from where it began, and one that a closure joins overlaps so much."""
+
+    local_map_m: Positive = 100.0
+    min_overlap: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.4
+
+
+KISS_SLAM = KissSlamSettings()
+
+
+class KissSlam(KissIcp):
+    """KISS-SLAM: KISS-ICP, loop closures between local maps by MapClosures, pose graph."""
+
+    def __init__(self, settings: KissSlamSettings = KISS_SLAM) -> None:
+        config = _imported("kiss_slam.config", "kiss-slam", "slam").load_config(None)
+        _import_open3d("slam")
+        config.local_mapper.splitting_distance = settings.local_map_m
+        config.loop_closer.overlap_threshold = settings.min_overlap
+        odometry = _configured_kiss(config.odometry, config.odometry.preprocessing, settings)
+        self.description = (
+            f"KISS-SLAM, {odometry}; loops closed between local maps of {settings.local_map_m:g} m that "
+            f"overlap by {settings.min_overlap:g}, pose graph optimized at the end"
+        )
+        self.slam = _imported("kiss_slam.slam", "kiss-slam", "slam").KissSLAM(config)
+        self.at_stamp, self.T_odom_map = AtStamp(), np.eye(4)
+        self.held = list[tuple[int, float]]()
+
+    def final_poses(self) -> Matrix:
+        """The poses at the stamps of all scans after the last optimization, which crashes on a single scan."""
+        if len(self.held) == 1:
+            return np.eye(4)[None]
+        self.slam.generate_new_node()
+        self.slam.local_map_graph.erase_last_local_map()
+        poses, _ = self.slam.fine_grained_optimization()
+        at_stamp = AtStamp()
+        return np.array([at_stamp.move(pose, *held) for pose, held in zip(poses, self.held, strict=True)])
+
+    def _registered(self, frame: NDArray[np.float64], times: NDArray[np.float64]) -> Pose:
+        """The pose without the corrections of closures."""
+        local_map = self.slam.local_map_graph.last_local_map
+        self.slam.process_scan(frame, times)
+        T_odom_lidar = self.T_odom_map @ local_map.local_trajectory[-1]
+        if self.slam.local_map_graph.last_local_map is not local_map:
+            self.T_odom_map = T_odom_lidar
+        return T_odom_lidar
 
 
 Preset = Literal["outdoor", "indoor", "kitti"]
@@ -454,7 +511,7 @@ class Open3dPairs(_Chained):
         return clouds
 
 
-def _import_open3d() -> Any:
+def _import_open3d(extra: str = "baselines") -> Any:
     """Open3D, with the libusb it needs, which slim machines lack, loaded from the package that ships it."""
     try:
         libusb = importlib.import_module("libusb_package")
@@ -463,7 +520,7 @@ def _import_open3d() -> Any:
         path = None
     if path is not None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-    open3d = _imported("open3d", "open3d, or the libusb-package that it needs,")
+    open3d = _imported("open3d", "open3d, or the libusb-package that it needs,", extra)
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
 
@@ -496,6 +553,7 @@ BASELINES: dict[str, Entry] = {
     "open3d-multiscale": Entry(partial(Open3dPairs, "point-to-plane"), "open3d", MULTISCALE, None),
     "open3d-gicp": Entry(partial(Open3dPairs, "plane-to-plane"), "open3d", OPEN3D, PLANAR_OPEN3D, is_raised=True),
     "kiss-icp": Entry(KissIcp, "kiss-icp", KISS, PLANAR_KISS),
+    "kiss-slam": Entry(KissSlam, "kiss-slam", KISS_SLAM, None),
     "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),
     "small-vgicp": Entry(SmallGicpModel, "small-gicp", VGICP, PLANAR_VGICP, is_raised=True),
     "genz-icp": Entry(GenzIcp, "genz-icp", GENZ, None, forgets=False),

@@ -25,7 +25,7 @@ from scanchain.comparison.results import method_folder
 from scanchain.comparison.table import COLUMNS, Row, Table, markdown, read_table, text
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import absolute_error, pair
+from scanchain.evaluation import absolute_error, pair, path_length
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.runs.job import Progress
@@ -211,6 +211,31 @@ def test_one_that_is_not_installed_is_a_gap_with_the_command_that_fills_it(offic
     two = msgspec.structs.replace(table, rows=[*table.rows, msgspec.structs.replace(missing, name="genz-icp")])
     (line,) = [each for each in text(two).splitlines() if "-icp" in each]
     assert line == "not installed: kiss-icp, genz-icp; pip install 'scanchain[baselines]'"
+
+
+@pytest.mark.usefixtures("in_process")
+def test_poses_that_a_method_optimizes_after_the_last_scan_are_its_trajectory(office, tmp_path):
+    settings = toml(tmp_path / "a.toml", '[optimized]\nmethod = "bad_odometries:Doubled"\n')
+    table = run(office, tmp_path, "optimized", config_file=settings)
+    x = read_tum(method_folder(tmp_path / "out", "optimized") / "trajectory.tum").positions
+    assert row(table, "optimized").status is Status.OK and len(x) == 60
+    assert np.linalg.norm(x[-1] - x[0]) == pytest.approx(0.2 * 59, abs=1e-6)
+
+
+@pytest.mark.usefixtures("own_processes")
+def test_kiss_slam_is_measured_by_its_optimized_trajectory_over_several_local_maps(tmp_path):
+    pytest.importorskip("kiss_slam", reason="kiss-slam is not installed; pip install 'scanchain[slam]'")
+    log = made.log("town", seconds=5, sensor="vlp-16")
+    settings = toml(tmp_path / "a.toml", "[kiss-slam]\nlocal_map_m = 4.0\n")
+    table = run(log, tmp_path, "kiss-slam", "kiss-icp", config_file=settings)
+    slam = row(table, "kiss-slam")
+    says(slam.description, "local maps of 4 m")
+    assert slam.status is Status.OK, slam.reason
+    trajectories = [method_folder(tmp_path / "out", name) / "trajectory.tum" for name in ("kiss-slam", "kiss-icp")]
+    optimized, odometry = (read_tum(path) for path in trajectories)
+    assert len(optimized) == len(odometry) == 50 and path_length(odometry.poses)[-1] > 12.0
+    assert 0.0 < np.abs(optimized.poses - odometry.poses).max() < 0.3
+    assert slam.figures["ate_m"] < 0.2
 
 
 def test_a_verdict_fails_nothing_and_a_method_that_did_not_finish_does(office, good, monkeypatch, capfd):

@@ -22,7 +22,7 @@ from scanchain.settings import Override, config_keys, leaves, load_settings, rea
 _ANY = "matcher"  # ours with the matcher that the settings name
 _VARIANTS = ("", "+loops", "+imu")  # of ours
 OURS = tuple(f"{name}{variant}" for name in (*MATCHERS, _ANY) for variant in _VARIANTS)
-_ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti", "open3d-multiscale")
+_ON_REQUEST = ("kiss-slam", "genz-icp-indoor", "genz-icp-kitti", "open3d-multiscale")
 COMMAND = "command"  # base of a method that is a command, and the key of its table
 SCANS, POSES = "{scans}", "{poses}"  # in a command: the folder of PLY files, and the TUM file that it writes
 _BASE = "method"  # the key of a table that names the method it is a variant of

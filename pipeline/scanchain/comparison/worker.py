@@ -73,7 +73,8 @@ class _Others:
         """Nothing: its error is bounded by the other trajectories."""
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        return odometry
+        optimized = getattr(self.odometry, "final_poses", None)
+        return Trajectory(odometry.stamps_ns, optimized()) if optimized is not None else odometry
 
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
