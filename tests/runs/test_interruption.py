@@ -82,7 +82,7 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
     out, stamps_ns = tmp_path / "run", read_tum(whole / "odometry.tum").stamps_ns
     assert pq.read_table(whole / "loops.parquet").num_rows > 0
     reached = []
-    for interruption, share in ((signal.SIGKILL, 0.1), (signal.SIGINT, 0.25), (signal.SIGKILL, 0.4)):
+    for interruption, share in ((signal.SIGKILL, 0.1), (signal.SIGINT, 0.2), (signal.SIGKILL, 0.3)):
         child = killing.start(office, out, *RECORDED, "--resume")
         killing.wait_for_steps(child, out, share * len(stamps_ns))
         child.send_signal(interruption)
