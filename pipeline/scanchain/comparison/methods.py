@@ -67,14 +67,14 @@ class Variation(NamedTuple):
 
     @property
     def overrides(self) -> tuple[Override, ...]:
-        """What it sets for ours; none where only other methods have the key."""
+        """Keys and values for ours; none where only other methods have the key."""
         if len(self._keys) > 1:
             raise InputError(f"--vary {self.key}: there are several, {' and '.join(self._keys)}; give one of them")
         return tuple(Override(key, self.value, f"--vary {self.key}") for key in self._keys)
 
     @property
     def of_log(self) -> tuple[Override, ...]:
-        """What it sets for the log, and so for all methods."""
+        """Keys and values for the log, and so for all methods."""
         return self.overrides if [key for key in self._keys if key.startswith("log.")] else ()
 
     def of(self, method: Method, dimension: int) -> Method | None:

@@ -37,7 +37,7 @@ class DualBound:
 
     @property
     def is_minimum(self) -> bool:
-        """Whether S − Λ is positive definite, so that X is the global minimum."""
+        """True where S − Λ is positive definite, so that X is the global minimum."""
         return self.shift <= _POSITIVE
 
 
@@ -114,12 +114,12 @@ class Relaxation:
         while not last.is_minimum and np.isfinite(last.shift) and self._left > 0:
             if X.shape[1] == self._d + _COLUMNS:
                 break
-            X = self._descended(self._lifted(X, last))
+            X = self._descended(self._lifted(X))
             last = self.dual(X)
             best = max(best, last, key=lambda each: each.value)
         return X, best
 
-    def _lifted(self, X: Matrix, bound: DualBound) -> Matrix:
+    def _lifted(self, X: Matrix) -> Matrix:
         """X with one more column, of lower F where S − Λ has a negative eigenvalue."""
         v = np.random.default_rng(0).normal(size=(len(X), 1))
         for _ in range(_INVERSE_ITERATIONS):

@@ -190,7 +190,7 @@ def minimize(
     def evaluate(state: Values) -> Evaluation:
         at = problem.linearize(state)
         quadratic = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
-        chi2 = np.square(at.observations).sum(axis=1)
+        chi2 = at.chi2
         return Evaluation(state, at, loss.weight(chi2), quadratic + float(loss.loss(chi2).sum()))
 
     def model_at(now: Evaluation) -> LocalModel:

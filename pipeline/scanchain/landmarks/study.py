@@ -245,7 +245,7 @@ def study_log(folder: Path, options: Options) -> Study:
         solution = solve_range_log(log, options.noise)
     begin = working_s()
     at = solution.problem.linearize(solution.guess)
-    system = solution.problem.system(at, solution.loss.weight(np.square(at.observations).sum(axis=1)))
+    system = solution.problem.system(at, solution.loss.weight(at.chi2))
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     facts = _facts(log, solution, is_stated=options.noise is not None) | left_out

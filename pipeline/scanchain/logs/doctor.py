@@ -225,7 +225,7 @@ def _stamps(seen: Survey) -> Finding:
 
 
 def _drift(seen: Survey) -> str:
-    """How much faster or slower header stamps advance than log times, as text; empty where jitter hides it."""
+    """Drift of header stamps against log times, as text; empty where jitter hides it."""
     logged_s, stamps_s = 1e-9 * np.cumsum(np.diff([seen.log_times_ns, seen.stamps_ns]), axis=1)
     if (span_s := float(logged_s.max(initial=0.0))) < _LEAST_SPAN_S:
         return ""
