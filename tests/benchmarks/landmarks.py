@@ -14,6 +14,8 @@ Methods take turns.
 anonymous: that log, its halves and simulated ones without barcodes, and of how many wrong and right results the
 program warns by landmarks that are missed on most visits.
 
+robots: several robots of one simulated folder in one problem, and each alone: mean and range of seeds.
+
 nees: normalized estimation errors squared (tests.support.nees) of that log, and of simulated ones
 (tests.support.mrclam) whose systematic errors and noise are drawn anew for every seed: mean and range of seeds.
 """
@@ -29,14 +31,14 @@ import numpy as np
 from scanchain.graph.losses import RobustLoss
 from scanchain.landmarks.association import associated, visits
 from scanchain.landmarks.estimate import from_odometry, minimize
-from scanchain.landmarks.files import read_landmark_data, read_mrclam
+from scanchain.landmarks.files import read_landmark_data, read_mrclam, read_mrclams
 from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
-from scanchain.landmarks.ranges import OdometryNoise, reckon, solve_range_log
+from scanchain.landmarks.ranges import OdometryNoise, reckon, solve_range_log, solve_range_logs
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth
 from tests.benchmarks.harness import options_of, table
 from tests.support.mrclam import World, write_mrclam
-from tests.support.nees import HEADING_RAD, nees, truth_at
+from tests.support.nees import HEADING_RAD, nees, truth_at, truth_of
 from tests.support.scenes import DATA
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
@@ -162,7 +164,7 @@ def real_log(options):
             seconds[name].append((spent, state))
     row = table(log.name, "median ms", "min ms", "ATE m", "landmarks m")
     for name, runs in seconds.items():
-        ((accuracy,), *_) = against_truth((runs[-1][1],), nodes_s, landmarks, log)
+        ((accuracy,), *_) = against_truth((runs[-1][1],), [nodes_s], landmarks, [log])
         spent = 1e3 * np.array([run[0] for run in runs])
         errors = f"{accuracy.poses_m:.4f}", f"{accuracy.landmarks_m:.4f}"
         row(name, f"{np.median(spent):.1f}", f"{spent.min():.1f}", *errors)
@@ -202,13 +204,37 @@ def consistency(options):
         row(name, *(f"{mean:.2f} ({low:.2f} to {high:.2f})" for mean, low, high in spread))
 
 
+def several_robots(options):
+    row = table("robots", "ATE alone m", "together m", "positions", "headings", "poses", "landmarks", "map")
+    for count, name in (
+        *((count, "as MRCLAM") for count in (2, 3, 5)),
+        (3, "twice the noise"),
+        (3, "6 landmarks"),
+    ):
+        every = []
+        for seed in range(options.first, options.first + options.seeds):
+            with TemporaryDirectory() as folder:
+                robots = range(1, count + 1)
+                write_mrclam(Path(folder), World(seed, robots=tuple(robots), duration_s=300.0, **WORLDS[name]))
+                logs = read_mrclams(Path(folder), robots)
+            alone = [errors_of_log(log.seen(log.subjects > 0), 0.005).ate_m for log in logs]
+            solution = solve_range_logs(logs, None)
+            landmarks = logs[0].true_landmarks[solution.problem.measurements.landmarks - 6]
+            found = nees(solution, truth_of(logs, solution), landmarks, 0.005)
+            every.append((np.mean(alone), *found))
+        each = np.array(every)
+        spread = zip(each.mean(axis=0), each.min(axis=0), each.max(axis=0), strict=True)
+        cells = [f"{mean:.2f} ({low:.2f} to {high:.2f})" for mean, low, high in spread]
+        row(f"{count}, {name}", *(f"{mean:.3f}" for mean in each[:, :2].mean(axis=0)), *cells[2:])
+
+
 def without_barcodes(options):
     row = table("without barcodes", "ATE m", "landmarks found", "logged", "sightings of none", "contradicted")
     verdicts = []
 
     def found(name, log):
         part, solution = associated(log, None)
-        ((accuracy,), *_) = against_truth((solution.minimum.estimate.state,), solution.nodes_s, None, log)
+        ((accuracy,), *_) = against_truth((solution.minimum.estimate.state,), [solution.nodes_s], None, [log])
         seen, missed = visits(part, solution)
         count, contradicted = len(seen), np.count_nonzero(missed > seen)
         logged = len(np.unique(log.subjects))
@@ -218,8 +244,7 @@ def without_barcodes(options):
     log = read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot)
     is_early = log.seen_s < np.median(log.seen_s)
     for name, kept in ("", is_early | True), (", first half", is_early), (", second half", ~is_early):
-        part = replace(log, seen_s=log.seen_s[kept], subjects=log.subjects[kept], measured=log.measured[kept])
-        found(f"MRCLAM 6{name}", part)
+        found(f"MRCLAM 6{name}", log.seen(kept))
     for name in ("as MRCLAM", "twice the noise", "450 s", "6 landmarks"):
         for seed in range(options.first, options.first + options.seeds):
             with TemporaryDirectory() as folder:
@@ -235,7 +260,10 @@ def without_barcodes(options):
 
 
 def main():
-    choices = {"linear": linear, "log": real_log, "nees": consistency, "anonymous": without_barcodes}
+    choices = {
+        "linear": linear, "log": real_log, "nees": consistency, "robots": several_robots,
+        "anonymous": without_barcodes,
+    }  # fmt: skip
     options = options_of(__doc__, "which", cache=False, which=tuple(choices), robot=1, repeats=9, seeds=6, first=0)
     choices[options.which](options)
 

@@ -67,7 +67,9 @@ def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
 def test_odometry_equals_the_naive_one_and_finite_differences(turn):
     first, second, moved = np.array([1.0, 2.0, 3.0]), np.array([2.5, 1.0, 3.0 + turn]), np.array([0.4, 0.1, turn])
     residuals, jacobians = np.empty((1, 3)), np.empty((1, 3, 6))
-    factors.odometry(np.stack([first, second]), moved[None], np.eye(3)[None], residuals, jacobians)
+    factors.odometry(
+        np.stack([first, second]), np.zeros(1, int), moved[None], np.eye(3)[None], residuals, jacobians
+    )
     r, J = residuals[0], jacobians[0]
     assert np.allclose(r, naive_landmarks.odometry(first, second, moved), atol=1e-12)
     numeric = numeric_jacobian(

@@ -25,7 +25,7 @@ def arrays():
     }
 
 
-ALONE = Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt")
+ALONE = Options(("schur",), 1, (1,), None, "odometry", "levenberg-marquardt")
 
 
 def written(tmp_path, arrays):

@@ -25,7 +25,7 @@ def made_up_log(seed, duration_s=600.0, alike=0.0):
 
     def logged(*seen):
         return RangeLog(
-            "made up", times, velocities, *seen, 0, 0, 0, np.zeros(0), np.zeros((0, 3)), np.zeros(0, int),
+            "made up", 1, times, velocities, *seen, 0, 0, 0, np.zeros(0), np.zeros((0, 3)), np.zeros(0, int),
             np.zeros((0, 2)),
         )  # fmt: skip
 
@@ -70,8 +70,9 @@ def test_the_robots_own_errors_the_noise_and_its_effect_are_found():
         solution = solve_range_log(log, None)
         consistency.append(squared_distances(solution, landmarks, first).mean())
         own.append(solution.minimum.estimate.state.calibration)
-        assert solution.sigmas[4] == pytest.approx(SIGMAS[0] * 0.85, rel=0.25)  # Student's scale: smaller
-        spread_m = np.hypot(solution.sigmas[5], 3.0 * solution.sigmas[6])  # at 3 m
+        bearing_rad, range_m, range_share = solution.sigmas[1][0]
+        assert bearing_rad == pytest.approx(SIGMAS[0] * 0.85, rel=0.25)  # Student's scale: smaller
+        spread_m = np.hypot(range_m, 3.0 * range_share)  # at 3 m
         assert spread_m == pytest.approx(SIGMAS[1] * 0.85, rel=0.25)
         noise = solution.consistency
         assert solution.minimum.converged and 0.7 < noise.motion / noise.motion_freedom < 1.3

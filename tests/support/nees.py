@@ -36,6 +36,12 @@ def truth_at(log, nodes_s):
     return np.stack([np.interp(nodes_s, log.true_s, each) for each in (x, y, np.unwrap(heading))], axis=1)
 
 
+def truth_of(logs, solution):
+    """True poses (K, 3) of several robots."""
+    times = np.split(solution.nodes_s, solution.problem.measurements.starts[1:])
+    return np.concatenate([truth_at(log, times_s) for log, times_s in zip(logs, times, strict=True)])
+
+
 def nees(solution, truth, landmarks, heading_rad=HEADING_RAD):
     """Of a solution with true poses (K, 3) and landmarks (L, 2), of which NaN are unknown."""
     state, evaluation = solution.minimum.estimate.state, solution.minimum.estimate

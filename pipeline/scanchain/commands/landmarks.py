@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinear files")
 _ALONE = {  # options that apply to one kind of problem only
-    "robot": ("--robot", *_OF_LOGS),
+    "robots": ("--robot", *_OF_LOGS),
     "noise": ("--odometry-noise", *_OF_LOGS),
     "ignore_barcodes": ("--ignore-barcodes", *_OF_LOGS),
     "guess": ("--guess", *_OF_NONLINEAR),
@@ -49,7 +49,14 @@ _ALONE = {  # options that apply to one kind of problem only
     show_default=True,
     help="Timed repetitions; the median is reported.",
 )
-@click.option("--robot", type=click.IntRange(1), default=1, show_default=True, help="Robot of an MRCLAM folder.")
+@click.option(
+    "--robot",
+    "robots",
+    default="1",
+    show_default=True,
+    metavar="N,...",
+    help="Robots of an MRCLAM folder, or all; several are estimated in one problem, as they see each other.",
+)
 @click.option(
     "--odometry-noise",
     "noise",
@@ -82,6 +89,7 @@ def landmarks(
     data: tuple[Path, ...],
     out: Path,
     methods: str,
+    robots: str,
     noise: str | None,
     recording: Path | None,
     force: bool,
@@ -91,7 +99,8 @@ def landmarks(
     """Solve landmark SLAM problems, and compare linear solvers on them.
 
     DATA is an npz file with a linear problem or with bearing and range measurements, or a folder of the UTIAS
-    MRCLAM data sets, of which the log of one robot is used. Estimates, pictures and report.html go to DIR.
+    MRCLAM data sets, of which the log of one robot is used, or of several together. Estimates, pictures and
+    report.html go to DIR.
 
     Methods: default, pinv (below 3,000 unknowns), lu, lu_colamd, qr, qr_colamd, cholesky, schur, or all of them.
     The log of a robot is always estimated by schur; the others are compared on its linear system.
@@ -103,6 +112,7 @@ def landmarks(
       scanchain landmarks 2d_nonlinear.npz --guess origin --methods cholesky,schur --out runs/nonlinear
       scanchain landmarks 2d_nonlinear.npz --optimizer gauss-newton --out runs/gn --recording gn.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
+      scanchain landmarks MRCLAM_Dataset6 --robot all --out runs/together
       scanchain landmarks MRCLAM_Dataset6 --ignore-barcodes --out runs/anonymous
     """
     from scanchain.clock import announcing_compilation
@@ -113,7 +123,7 @@ def landmarks(
     from scanchain.runs.directory import RunDirectory
     from scanchain_viz.report.problems import write_report
 
-    chosen = Options(parse_methods(methods), noise=_noise(noise), **more)
+    chosen = Options(parse_methods(methods), robots=_robots(robots), noise=_noise(noise), **more)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
     _check_options({"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
@@ -151,6 +161,16 @@ def _check_options(kinds: Collection[str]) -> None:
     for name, (flag, kind, what) in _ALONE.items():
         if kind not in kinds and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise InputError(f"{flag} is for {what} alone, and DATA names none; leave it out")
+
+
+def _robots(text: str) -> tuple[int, ...]:
+    """Numbers of robots, none for all."""
+    if text == "all":
+        return ()
+    names = text.split(",")
+    if not all(name.strip().isdecimal() for name in names) or len(set(map(int, names))) < len(names):
+        raise InputError(f"--robot is {text!r}; give a number, several as 1,2,5, or all")
+    return tuple(map(int, names))
 
 
 def _noise(text: str | None) -> OdometryNoise | None:

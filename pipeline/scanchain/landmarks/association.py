@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from itertools import combinations, permutations
 
 import numpy as np
@@ -118,7 +117,7 @@ def _with(log: RangeLog, subjects: NDArray[np.int64]) -> RangeLog:
             f"{log.name}: without barcodes fewer than two landmarks are recognized again; give a longer log, "
             "or leave out --ignore-barcodes"
         )
-    return replace(log, seen_s=log.seen_s[kept], subjects=subjects[kept], measured=log.measured[kept])
+    return log.seen(kept, subjects)
 
 
 class _Filter:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,8 @@ def read_landmark_data(path: Path) -> LandmarkData:
         measured_covariance=np.broadcast_to(_covariance(path, "sigma_landmark", arrays), (len(table), 2, 2)),
         landmarks=np.arange(len(landmarks)),
     )
-    return LandmarkData(path.stem, kind, measurements, poses, landmarks)
+    true_poses = poses if len(poses) else np.full_like(reckoned, np.nan)
+    return LandmarkData(path.stem, kind, measurements, true_poses, landmarks)
 
 
 def _read(path: Path) -> dict[str, Matrix]:
@@ -164,8 +166,10 @@ class RangeLog:
     """Log of one robot, in order of time.
 
     name : of the folder and the robot
-    times_s, velocities : (M,), (M, 2) wheel odometry: forward in m/s, turning in rad/s, whenever either changes
-    seen_s, subjects, measured : (N,), (N,) landmark subjects, (N, 2) bearing in rad and range in m
+    robot : its number
+    times_s, velocities : (M,), (M, 2) wheel odometry: forward in m/s, turning in rad/s, whenever either changes,
+        and at the end
+    seen_s, subjects, measured : (N,), (N,) landmarks, or −n for robot n, (N, 2) bearing in rad and range in m
     of_robots, unknown : observations left out: of other robots, and of barcodes without a subject
     outside : observations left out since no odometry was logged at their time
     true_s, true_poses : (T,), (T, 3) motion capture x, y, heading; empty where the folder has none
@@ -173,6 +177,7 @@ class RangeLog:
     """
 
     name: str
+    robot: int
     times_s: NDArray[np.float64]
     velocities: Matrix
     seen_s: NDArray[np.float64]
@@ -186,18 +191,40 @@ class RangeLog:
     true_subjects: NDArray[np.int64]
     true_landmarks: Matrix
 
+    def seen(self, kept: NDArray[np.bool_], subjects: NDArray[np.int64] | None = None) -> RangeLog:
+        """The log with these of its observations (N,), of other subjects (N,) if given."""
+        named = self.subjects if subjects is None else subjects
+        return replace(self, seen_s=self.seen_s[kept], subjects=named[kept], measured=self.measured[kept])
 
-def read_mrclam(folder: Path, robot: int) -> RangeLog:
-    """Log of robot ``robot``; raises InputError for anything missing or wrong."""
+
+def robots_of(folder: Path) -> tuple[int, ...]:
+    """Numbers of the robots of an MRCLAM folder; raises InputError if it is none."""
     if not (folder / "Barcodes.dat").is_file():
         raise InputError(
             f"{folder}: is no MRCLAM folder (Barcodes.dat is missing); name an npz file or such a folder"
         )
+    names = (re.findall(r"^Robot(\d+)_Odometry\.dat$", file.name) for file in folder.iterdir())
+    return tuple(sorted(int(name[0]) for name in names if name))
+
+
+def read_mrclams(folder: Path, robots: Sequence[int]) -> list[RangeLog]:
+    """Logs of several robots with their observations of each other; raises InputError as ``read_mrclam`` does."""
+    logs = [read_mrclam(folder, robot, robots) for robot in robots]
+    for log in logs:
+        for k, other in enumerate(logs):
+            begin_s, *_, end_s = log.times_s
+            is_lost = (other.subjects == -log.robot) & ((other.seen_s < begin_s) | (other.seen_s > end_s))
+            logs[k] = replace(other.seen(~is_lost), outside=other.outside + int(is_lost.sum()))
+    return logs
+
+
+def read_mrclam(folder: Path, robot: int, together: Sequence[int] = ()) -> RangeLog:
+    """Log of robot ``robot``; raises InputError for anything missing or wrong.
+
+    together : robots whose observations by this one are kept
+    """
     name = f"Robot{robot}_Odometry.dat"
-    if not (folder / name).is_file():
-        there = sorted(
-            int(found[0]) for file in folder.iterdir() if (found := re.findall(r"^Robot(\d+)_Odo", file.name))
-        )
+    if robot not in (there := robots_of(folder)):
         listed = ", ".join(map(str, there)) or "none"
         raise InputError(f"{folder}: has no {name}; --robot must be one of those logged there: {listed}")
     odometry = _by_time(_numbers(folder / name, 3))
@@ -209,26 +236,30 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
     subject_of = dict(zip(codes, subjects, strict=True))
     subject = np.array([subject_of.get(code, 0) for code in seen[:, 1].tolist()], np.int64)
     timely = (seen[:, 0] >= odometry[0, 0]) & (seen[:, 0] <= odometry[-1, 0])
-    used = (subject > _ROBOTS) & timely
-    if not used.any():
+    is_met = np.isin(subject, [each for each in together if each != robot])
+    used = ((subject > _ROBOTS) | is_met) & timely
+    if not (used & ~is_met).any():
         raise InputError(
             f"{folder}: robot {robot} saw no landmark while its odometry was logged; choose another robot"
         )
-    changes = odometry[np.append(True, (np.diff(odometry[:, 1:], axis=0) != 0.0).any(axis=1))]
+    is_change = np.append(True, (np.diff(odometry[:, 1:], axis=0) != 0.0).any(axis=1))
+    is_change[-1] = True
+    changes = odometry[is_change]
     truth = folder / f"Robot{robot}_Groundtruth.dat"
     true = _by_time(_numbers(truth, 4)) if truth.is_file() else np.empty((0, 4))
     survey = folder / "Landmark_Groundtruth.dat"
     landmarks = _numbers(survey, 5) if survey.is_file() else np.empty((0, 5))
     return RangeLog(
         name=f"{folder.resolve().name} robot {robot}",
+        robot=robot,
         times_s=changes[:, 0],
         velocities=np.ascontiguousarray(changes[:, 1:]),
         seen_s=seen[used, 0],
-        subjects=subject[used],
+        subjects=np.where(is_met, -subject, subject)[used],
         measured=np.ascontiguousarray(seen[used][:, [3, 2]]),
-        of_robots=int(((subject >= 1) & (subject <= _ROBOTS)).sum()),
+        of_robots=int(((subject >= 1) & (subject <= _ROBOTS) & ~is_met).sum()),
         unknown=int((subject < 1).sum()),
-        outside=int(((subject > _ROBOTS) & ~timely).sum()),
+        outside=int((((subject > _ROBOTS) | is_met) & ~timely).sum()),
         true_s=true[:, 0],
         true_poses=true[:, 1:],
         true_subjects=landmarks[:, 0].astype(np.int64),

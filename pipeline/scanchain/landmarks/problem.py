@@ -22,7 +22,7 @@ class LandmarkData:
 
     kind : whether an observation is the landmark's position relative to the pose, or its bearing and range
     measurements : ``measured`` is relative x, y in m in a linear problem
-    true_poses, true_landmarks : (K, 2), (L, 2) m; (0, 2) and NaN where unknown
+    true_poses, true_landmarks : (K, 2), (L, 2) m, NaN where unknown
     """
 
     name: str
@@ -64,16 +64,18 @@ _COMPONENTS = ("x", "y", "heading")
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Columns of A: pose after pose, the robot's calibration, landmark after landmark.
+    """Columns of A: pose after pose, the robots' calibration, landmark after landmark.
 
     pose_size : unknowns of a pose, 2 (x, y) or 3 (x, y, heading)
     landmarks : (L,) their names, as numbers; calibration : names of its unknowns
+    is_chain : whether only successive poses are joined; not if robots see each other
     """
 
     poses: int
     pose_size: int
     landmarks: NDArray[np.int64]
     calibration: tuple[str, ...] = ()
+    is_chain: bool = True
 
     @property
     def split(self) -> int:
@@ -247,11 +249,12 @@ class Measurements:
     """Measurements of a bearing-range problem.
 
     first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
-    motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
-        of the former, without in the world's
-    observed : (N, 2) pose, landmark
+    motion, motion_covariance : (K − R, p), (K − R, p, p) from each pose to the robot's next: with headings in the
+        frame of the former, without in the world's
+    observed : (N, 2) pose, and landmark or, from L on, the pose of a robot that is seen
     measured, measured_covariance : (N, 2), (N, 2, 2) bearing in rad, range in m
     landmarks : (L,) their names, as numbers
+    starts : (R,) first pose of each robot; their poses stand one robot after the other
     """
 
     first_pose: NDArray[np.float64]
@@ -263,28 +266,43 @@ class Measurements:
     measured: Matrix
     measured_covariance: Matrix
     landmarks: NDArray[np.int64]
+    starts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+
+    @property
+    def poses(self) -> int:
+        """Number of poses, K."""
+        return len(self.motion) + len(self.starts)
+
+    @property
+    def before(self) -> NDArray[np.int64]:
+        """Poses from which the motions start, (K − R,)."""
+        return np.setdiff1d(np.arange(self.poses), np.append(self.starts[1:], self.poses) - 1)
 
 
 class BearingRangeProblem:
     """Prior on the first pose, motion from pose to pose, bearings and ranges.
 
-    ``motion_columns`` (K − 1, 2 p + A) and ``observation_columns`` (N, p + 2 + B) are the columns of their
-    unknowns, ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
+    ``motion_columns`` (K − R, 2 p + A) and ``observation_columns`` (N, p + 2 + B) are the columns of their
+    unknowns, ``motion_whitening`` (K − R, p, p) is W with WᵀW = Σ⁻¹.
     """
 
     def __init__(self, measurements: Measurements) -> None:
         given = measurements
         self.measurements = given
         size = given.motion.shape[1]
-        layout = Layout(len(given.motion) + 1, size, given.landmarks, given.calibration.names)
+        seen_from, seen = given.observed.T
+        is_robot = seen >= len(given.landmarks)
+        layout = Layout(given.poses, size, given.landmarks, given.calibration.names, not is_robot.any())
         self._first, self.motion_whitening = whitening(given.first_covariance), whitening(given.motion_covariance)
         self._observation = np.ascontiguousarray(whitening(given.measured_covariance))
         poses = pose_columns(layout, np.arange(layout.poses))
         own = np.arange(layout.split, layout.landmark_start)
-        seen_from, seen = given.observed.T
         sensing, moving = (layout.split + each for each in (given.calibration.sensing, given.calibration.moving))
-        pairs = np.concatenate([poses[seen_from], landmark_columns(layout, seen), sensing], axis=1)
-        moves = np.concatenate([poses[:-1], poses[1:], moving], axis=1)
+        points = landmark_columns(layout, seen)
+        points[is_robot] = poses[seen[is_robot] - len(given.landmarks), :2]
+        pairs = np.concatenate([poses[seen_from], points, sensing], axis=1)
+        self._before = given.before
+        moves = np.concatenate([poses[self._before], poses[self._before + 1], moving], axis=1)
         groups = [
             np.repeat(poses[:1], size, axis=0), own[:, None], np.repeat(moves, size, axis=0),
             np.repeat(pairs, 2, axis=0),
@@ -299,26 +317,27 @@ class BearingRangeProblem:
         A motion's residual is divided by the scale of the logged distances: noise of a fixed variance in the
         world's units would favor a small world, as the scale of the ranges is unknown as well.
         """
-        given, p, W = self.measurements, state.poses.shape[1], self.motion_whitening
+        given, p, W, before = self.measurements, state.poses.shape[1], self.motion_whitening, self._before
         calibration = given.calibration
         motion, J_motion = np.empty(given.motion.shape), np.empty((len(given.motion), p, 2 * p))
         if p == 2:
-            motion = (W @ (np.diff(state.poses, axis=0) - given.motion)[..., None])[..., 0]
+            motion = (W @ (state.poses[before + 1] - state.poses[before] - given.motion)[..., None])[..., 0]
             J_motion = np.concatenate([-W, W], axis=-1)
         elif not calibration.names:
-            factors.odometry(state.poses, given.motion, W, motion, J_motion)
+            factors.odometry(state.poses, before, given.motion, W, motion, J_motion)
         else:
             scale = 1.0 + state.calibration[calibration.moving[:, :1]]
             W = W / np.concatenate([scale, scale, np.ones_like(scale)], axis=1)[:, None]
-            factors.odometry(state.poses, calibration.moved(given.motion, state.calibration), W, motion, J_motion)
+            moved = calibration.moved(given.motion, state.calibration)
+            factors.odometry(state.poses, before, moved, W, motion, J_motion)
             slope = -W @ calibration.slope
             slope[..., 0] -= (motion - W[..., 2] * motion[:, 2:] / W[:, 2, 2:]) / scale
             J_motion = np.concatenate([J_motion, slope], axis=-1)
         seen = np.empty(given.measured.shape)
         J_seen = np.empty((len(seen), 2, p + 2 + calibration.sensing.shape[1]))
         factors.bearing_range(
-            state.poses, state.landmarks, given.observed, given.measured, self._observation, state.calibration,
-            calibration.sensing, seen, J_seen,
+            state.poses, np.vstack([state.landmarks, state.poses[:, :2]]), given.observed, given.measured,
+            self._observation, state.calibration, calibration.sensing, seen, J_seen,
         )  # fmt: skip
         off = state.poses[0] - given.first_pose
         off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.clock import working_s
-from scanchain.data import Matrix
+from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.estimate import Minimum, StudentLoss, from_odometry, growing, minimize
@@ -24,8 +27,10 @@ OWN = (
     "forward scale", "forward lost in turning", "turn scale", "drift", "delay",
     "range scale", "depth share", "range offset", "bearing offset", "bearing scale", "lever arm",
 )  # fmt: skip
-OWN_UNITS = ("", " m/rad", "", " rad/m", " s", "", "", " m", " rad", "", " m")
+TO_ROBOTS = "range offset to robots"  # on whose bodies the barcodes are; of robots that see each other
+OWN_UNITS = ("", " m/rad", "", " rad/m", " s", "", "", " m", " rad", "", " m", " m")
 PRIOR_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3, 0.02, 1.0, 0.05, 0.03, 0.03, 0.1])  # differential drives, cameras
+_TO_ROBOTS_M = 0.2  # the same of the offset to robots
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # steps of the finite differences
 
 
@@ -99,7 +104,7 @@ def _integrated(
 _LAGS_S = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])  # bin edges; errors farther apart count as independent
 _DRAWS = 8  # samples of the uncertainty of the state
 _FEWEST = 30  # least number of pairs from which a correlation is estimated
-_STATED = np.array([10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0])  # degrees of freedom that the prior noise counts as
+_STATED = 10.0, 1.0  # degrees of freedom that the prior noise of odometry and sensors counts as
 _LEAST_REDUNDANCY = 0.05  # least redundancy as a share of the sightings
 
 
@@ -152,7 +157,7 @@ class Consistency:
 
     motion, sensor : χ² of the motions, of bearings and ranges, weighed
     motion_freedom, sensor_freedom : degrees of freedom of these: measurements minus those absorbed by the state
-    sources, sources_freedom : (7,) the parts of these due to each source of noise
+    sources, sources_freedom : (S,) the parts of these due to each source of noise, of odometry first
     """
 
     motion: float
@@ -162,12 +167,12 @@ class Consistency:
     sources: NDArray[np.float64]
     sources_freedom: NDArray[np.float64]
 
-    def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Factors by which the variances, those of odometry first, should grow, (7,); one where they are right.
+    def growth(self, stated: NDArray[np.float64], freedom: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Factors by which the variances, those of odometry first, should grow, (S,); one where they are right.
 
-        stated : (7,) their prior values, in units of the present ones
+        stated, freedom : (S,) prior values in units of the present ones, and the degrees of freedom they count as
         """
-        return (self.sources + _STATED * stated) / (self.sources_freedom + _STATED)
+        return (self.sources + freedom * stated) / (self.sources_freedom + freedom)
 
 
 def consistency(
@@ -186,7 +191,7 @@ def consistency(
     with weights w and efficiency e, each counting as the share ``share`` (N,) of an independent one, they are
     Σ w r² and Σ share − e w h (Lange et al. 1989), divided in proportion to the sources' variances.
 
-    sources, seen_sources : (K − 1, 4, 3, 3), (N, 3, 2) covariance of motions, variances of bearings and ranges
+    sources, seen_sources : (M, s, 3, 3), (N, S − s, 2) covariance of motions, variances of bearings and ranges
     """
     at, W = minimum.estimate.at, problem.motion_whitening
     parts = W[:, None] @ sources @ np.swapaxes(W, 1, 2)[:, None]
@@ -212,7 +217,7 @@ def consistency(
 
 _ANCHOR = 1e-8  # m², rad²: the first pose defines the world frame
 SENSOR = np.square([0.03, 0.05, 0.02])  # rad², m², 1; initial value of the noise of bearings, ranges, ranges per m
-_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4, 1e-4])  # odometry as in OdometryNoise, sensor; rad, m
+_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3]), np.square([3e-4, 3e-4, 1e-4])  # odometry as in OdometryNoise, sensor
 _LEAST_FREEDOM = 1e-3  # least redundancy of the observations
 _TURNS, _CHANGE = 20, 0.1  # largest number of noise estimates, and the relative change that ends them
 _RECKONED = 2  # number of these after which dead reckoning is repeated with the calibration found so far
@@ -223,11 +228,12 @@ _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of �
 class RangeSolution:
     """A minimum, the noise it was found for, and their consistency.
 
-    nodes_s : (K,) times of the poses, those of the observations
+    nodes_s : (K,) times of the poses, those of the observations, robot after robot
     reckoned : dead reckoning by the logged velocities, every landmark where it was first seen
     problem, guess, minimum : problem with the estimated noise; initial guess of the first minimization; result of
         the last one, with the first pose at the origin
-    variances : (7,) of the odometry's sources as in ``OdometryNoise``, of bearings, of ranges, of these per meter
+    variances : (4 R + 3 G,) of each robot's odometry by sources as in ``OdometryNoise``; of each sensor's
+        bearings, ranges, and these per meter: G = R or, with observations of robots, a sensor more, R + 1
     iterations, time_s : steps after the guess; total time, without reading
     """
 
@@ -244,9 +250,10 @@ class RangeSolution:
     time_s: float
 
     @property
-    def sigmas(self) -> list[float]:
-        """Standard deviations of the odometry's sources, of bearing in rad, range in m and range per m."""
-        return np.sqrt(self.variances).tolist()
+    def sigmas(self) -> tuple[Matrix, Matrix]:
+        """Standard deviations (R, 4) of the robots' odometry and (G, 3) of the sensors, m and rad."""
+        wheels, sensors = np.split(np.sqrt(self.variances), [4 * len(self.problem.measurements.starts)])
+        return wheels.reshape(-1, 4), sensors.reshape(-1, 3)
 
 
 def units_of_noise(measured: Matrix) -> Matrix:
@@ -269,35 +276,167 @@ def solve_range_log(
     correlated, as estimated from the residuals (``SightingPairs``): each sighting counts as a share of an
     independent one. Raises InputError if there are too few observations for that.
     """
-    begin, solver = working_s(), create_solver(ESTIMATOR)
-    nodes_s = np.unique(log.seen_s) if nodes_s is None else nodes_s
-    landmarks, landmark = np.unique(log.subjects, return_inverse=True)
-    observed = np.stack([np.searchsorted(nodes_s, log.seen_s), landmark], axis=1)
-    sightings = SightingPairs(log.seen_s, landmark)
-    unit, every = units_of_noise(log.measured), np.arange(len(OWN))
+    begin = working_s()
+    model = _Model([log], [np.unique(log.seen_s) if nodes_s is None else nodes_s])
+    reckoning, stated = model.reckon(np.zeros((1, WHEELS))), model.stated(noise)
+    given = model.measurements(reckoning, stated)
+    guess = growing(given, create_solver(ESTIMATOR))
+    return _solved(model, noise, reckoning, stated, from_odometry(given), guess, begin)
 
-    def measurements(reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
-        own = Calibration(
-            OWN, np.append(reckoning.own, np.zeros(len(OWN) - WHEELS)), PRIOR_SIGMA,
-            np.tile(every[:WHEELS], (len(nodes_s) - 1, 1)), reckoning.slope,
-            np.tile(every[WHEELS:], (len(observed), 1)),
-        )  # fmt: skip
+
+def solve_range_logs(logs: Sequence[RangeLog], noise: OdometryNoise | None) -> RangeSolution:
+    """Estimate several robots in one problem: they see the same landmarks, and each other.
+
+    Each has errors and noise of its own; observations of robots are a sensor more, whose ranges have an offset, as
+    the barcodes are on the robots' bodies. The guess is what each robot estimates alone, moved onto the others by
+    the landmarks they have in common. Raises InputError as ``solve_range_log`` does, and for a robot without two
+    landmarks in common with the others.
+    """
+    if len(logs) == 1:
+        return solve_range_log(logs[0], noise)
+    begin = working_s()
+    seen = [[each.seen_s[each.subjects == -log.robot] for each in logs] for log in logs]
+    nodes = [np.unique(np.concatenate([log.seen_s, *others])) for log, others in zip(logs, seen, strict=True)]
+    alone = [
+        solve_range_log(log.seen(log.subjects > 0), noise, nodes_s)
+        for log, nodes_s in zip(logs, nodes, strict=True)
+    ]
+    model = _Model(logs, nodes)
+    own = np.array([each.minimum.estimate.state.calibration[:WHEELS] for each in alone])
+    wheels, sensors = zip(*(np.split(each.variances, [4]) for each in alone), strict=True)
+    variances = np.concatenate([*wheels, *sensors, *[SENSOR] * (model.sensors - len(logs))])
+    reckoned, guess = _together(logs, alone, model)
+    return _solved(model, noise, model.reckon(own), variances, reckoned, guess, begin)
+
+
+class _Model:
+    """Observations of all robots, and the measurements for given systematic errors and noise."""
+
+    def __init__(self, logs: Sequence[RangeLog], nodes: Sequence[NDArray[np.float64]]) -> None:
+        """Logs of the robots, and times (K,) of the poses of each."""
+        self.logs, self.nodes, robots = logs, nodes, np.arange(len(logs))
+        starts = np.cumsum([0, *map(len, nodes[:-1])])
+        seen_s, subjects, self.measured = (
+            np.concatenate(each)
+            for each in zip(*((log.seen_s, log.subjects, log.measured) for log in logs), strict=True)
+        )
+        robot = np.repeat(robots, [len(log.seen_s) for log in logs])
+        self.landmarks, landmark = np.unique(subjects[subjects > 0], return_inverse=True)
+        pose, target = np.empty_like(subjects), np.empty_like(subjects)
+        target[subjects > 0] = landmark
+        for r, (log, nodes_s, start) in enumerate(zip(logs, nodes, starts, strict=True)):
+            of, to = robot == r, subjects == -log.robot
+            pose[of] = start + np.searchsorted(nodes_s, seen_s[of])
+            target[to] = len(self.landmarks) + start + np.searchsorted(nodes_s, seen_s[to])
+        sensor = np.where(subjects > 0, robot, len(logs))
+        self.observed, self.starts, self.sensors = np.stack([pose, target], axis=1), starts, int(sensor.max()) + 1
+        _, pair = np.unique(np.stack([robot, subjects], axis=1), axis=0, return_inverse=True)
+        self.sightings = SightingPairs(seen_s, pair)
+        self.unit = _by_group(units_of_noise(self.measured), sensor, self.sensors)
+        self._driver = np.repeat(robots, [len(each) - 1 for each in nodes])
+        is_met = self.sensors > len(logs)
+        own, sigma = ((*OWN, TO_ROBOTS), (*PRIOR_SIGMA, _TO_ROBOTS_M)) if is_met else (OWN, PRIOR_SIGMA)
+        self.unknowns = len(own)
+        sensing = np.tile(np.arange(WHEELS, len(OWN)), (len(subjects), 1))
+        sensing[subjects < 0, OWN.index("range offset") - WHEELS] = len(OWN)
+        self._sensing, self._sigma = self.unknowns * robot[:, None] + sensing, np.tile(sigma, len(logs))
+        self._names = own if len(logs) == 1 else tuple(f"robot {log.robot} {name}" for log in logs for name in own)
+
+    def stated(self, noise: OdometryNoise | None) -> NDArray[np.float64]:
+        """Variances (4 R + 3 G,) that are assumed beforehand."""
+        wheels = (noise or OdometryNoise()).densities
+        return np.concatenate([np.tile(wheels, len(self.logs)), np.tile(SENSOR, self.sensors)])
+
+    def reckon(self, own: Matrix) -> Reckoning:
+        """Motions of all robots, with the errors (R, 5) of their wheels; the sources of each are its own."""
+        each = [reckon(*given) for given in zip(self.logs, self.nodes, own, strict=True)]
+        motion, sources, rest, slope = (
+            np.concatenate(parts)
+            for parts in zip(*((one.motion, one.sources, one.rest, one.slope) for one in each), strict=True)
+        )
+        return Reckoning(motion, _by_group(sources, self._driver, len(each)), rest, own.ravel(), slope)
+
+    def measurements(self, reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
+        """All measurements, with variances (4 R + 3 G,)."""
+        wheels, sensors = np.split(variances, [4 * len(self.logs)])
+        own = reckoning.own.reshape(-1, WHEELS)
+        value = np.pad(own, ((0, 0), (0, self.unknowns - WHEELS))).ravel()
+        moving = self.unknowns * self._driver[:, None] + np.arange(WHEELS)
         return Measurements(
             first_pose=np.zeros(3),
             first_covariance=_ANCHOR * np.eye(3),
             motion=reckoning.motion,
-            motion_covariance=reckoning.covariance(variances[:4]),
-            calibration=own,
-            observed=observed,
-            measured=log.measured,
-            measured_covariance=(variances[4:] @ unit)[..., None] * np.eye(2),
-            landmarks=landmarks,
+            motion_covariance=reckoning.covariance(wheels),
+            calibration=Calibration(self._names, value, self._sigma, moving, reckoning.slope, self._sensing),
+            observed=self.observed,
+            measured=self.measured,
+            measured_covariance=(sensors @ self.unit)[..., None] * np.eye(2),
+            landmarks=self.landmarks,
+            starts=self.starts,
         )
 
-    stated = np.concatenate([(noise or OdometryNoise()).densities, SENSOR])
-    reckoning, variances = reckon(log, nodes_s, np.zeros(WHEELS)), stated
-    loss, problem = StudentLoss(np.ones(len(observed))), BearingRangeProblem(measurements(reckoning, stated))
-    reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
+
+def _by_group(parts: Matrix, group: NDArray[np.int64], groups: int) -> Matrix:
+    """Parts (N, k, ...) each at the place of its group (N,), zeros elsewhere, (N, k · groups, ...)."""
+    result = np.zeros((len(parts), groups, *parts.shape[1:]))
+    result[np.arange(len(parts)), group] = parts
+    return result.reshape(len(parts), groups * parts.shape[1], *parts.shape[2:])
+
+
+def _together(logs: Sequence[RangeLog], alone: Sequence[RangeSolution], model: _Model) -> tuple[Values, Values]:
+    """Dead reckoning and estimates of all robots in the world of the first."""
+    where = [np.searchsorted(model.landmarks, each.problem.measurements.landmarks) for each in alone]
+    poses, waiting = np.empty((2, sum(map(len, model.nodes)), 3)), list(range(len(logs)))
+    landmarks = np.full((2, len(model.landmarks), 2), np.nan)
+    T, r = lie.identity(2), 0
+    while True:
+        waiting.remove(r)
+        for k, state in enumerate((alone[r].reckoned, alone[r].minimum.estimate.state)):
+            turned = state.poses[:, 2] + np.arctan2(T[1, 0], T[0, 0])
+            of = slice(model.starts[r], model.starts[r] + len(turned))
+            poses[k, of] = np.column_stack([lie.transform(T, state.poses[:, :2]), turned])
+            known = np.isfinite(landmarks[k, where[r]])
+            landmarks[k, where[r]] = np.where(known, landmarks[k, where[r]], lie.transform(T, state.landmarks))
+        if not waiting:
+            break
+        is_known = np.isfinite(landmarks[1, :, 0])
+        r = max(waiting, key=lambda each: is_known[where[each]].sum())
+        common = is_known[where[r]]
+        if common.sum() < 2:
+            raise InputError(f"{logs[r].name}: saw fewer than two landmarks that other robots saw; leave it out")
+        T = _onto(alone[r].minimum.estimate.state.landmarks[common], landmarks[1, where[r][common]])
+    own = np.array([each.minimum.estimate.state.calibration for each in alone])
+    own = np.pad(own, ((0, 0), (0, model.unknowns - len(OWN)))).ravel()
+    return Values(poses[0], landmarks[0], np.zeros_like(own)), Values(poses[1], landmarks[1], own)
+
+
+def _onto(points: Matrix, others: Matrix) -> Pose:
+    """Rigid motion of points (n, 2) onto others by two of them, of least median distance (Rousseeuw 1984)."""
+    candidates = list[tuple[float, Pose]]()
+    for pair in map(list, combinations(range(len(points)), 2)):
+        (ax, ay), (bx, by) = points[pair[1]] - points[pair[0]], others[pair[1]] - others[pair[0]]
+        T = lie.pose_2d(0.0, 0.0, np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
+        T[:2, 2] = (others[pair] - lie.transform(T, points[pair])).mean(axis=0)
+        off_m = np.linalg.norm(lie.transform(T, points) - others, axis=1)
+        candidates.append((float(np.median(off_m)), T))
+    return min(candidates, key=lambda each: each[0])[1]
+
+
+def _solved(
+    model: _Model,
+    noise: OdometryNoise | None,
+    reckoning: Reckoning,
+    variances: NDArray[np.float64],
+    reckoned: Values,
+    guess: Values,
+    begin: float,
+) -> RangeSolution:
+    """The minimum from a guess, with the noise found for it by restricted maximum likelihood."""
+    solver, stated, wheels = create_solver(ESTIMATOR), model.stated(noise), 4 * len(model.logs)
+    counted = np.repeat(_STATED, [wheels, len(stated) - wheels])
+    least = np.concatenate([np.tile(_LEAST[0], len(model.logs)), np.tile(_LEAST[1], model.sensors)])
+    loss = StudentLoss(np.ones(len(model.observed)))
+    problem = BearingRangeProblem(model.measurements(reckoning, variances))
     state, iterations, turn, is_last = guess, 0, 0, False
     while True:
         minimum = minimize(
@@ -308,29 +447,31 @@ def solve_range_log(
         at, weights = minimum.estimate.at, minimum.estimate.weights
         efficiency = loss.efficiency(at.chi2)
         covariance = Covariance(problem.system(at, efficiency * weights))
-        sources, seen_sources = variances[:4, None, None] * reckoning.sources, variances[4:, None] * unit
+        sources = variances[:wheels, None, None] * reckoning.sources
+        seen_sources = variances[wheels:, None] * model.unit
         found = consistency(problem, minimum, covariance, sources, seen_sources, loss.share, efficiency)
         if turn == 0 and not found.sensor_freedom > _LEAST_FREEDOM:
             raise InputError(
-                "the landmarks were seen too seldom to estimate the sensor's noise; give a longer log"
+                f"{model.logs[0].name}: the landmarks were seen too seldom to estimate the sensor's noise; "
+                "give a longer log"
             )
         if is_last:
             break
-        growth = found.growth(stated / variances)
+        growth = found.growth(stated / variances, counted)
         if noise is not None:
-            growth[:4] = 1.0
+            growth[:wheels] = 1.0
         turn += 1
         is_last = turn == _TURNS or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
-        variances = np.maximum(variances * growth, _LEAST)
+        variances = np.maximum(variances * growth, least)
         root, rng = np.sqrt(weights / loss.share)[:, None], np.random.default_rng(0)
         steps = np.array([covariance.sample(rng)[problem.observation_columns] for _ in range(_DRAWS)])
         absorbed = np.sqrt(efficiency) * root * (at.observation_rows @ steps[..., None])[..., 0]
-        loss = StudentLoss(sightings.share(sightings.correlation(root * at.observations, absorbed)))
+        loss = StudentLoss(model.sightings.share(model.sightings.correlation(root * at.observations, absorbed)))
         state = minimum.estimate.state
         if turn <= _RECKONED:
-            reckoning = reckon(log, nodes_s, state.calibration[:WHEELS])
-        problem = BearingRangeProblem(measurements(reckoning, variances))
+            reckoning = model.reckon(state.calibration.reshape(-1, model.unknowns)[:, :WHEELS])
+        problem = BearingRangeProblem(model.measurements(reckoning, variances))
     return RangeSolution(
-        nodes_s, reckoned, problem, guess, minimum, variances, loss, covariance, found, iterations,
-        working_s() - begin,
+        np.concatenate(model.nodes), reckoned, problem, guess, minimum, variances, loss, covariance, found,
+        iterations, working_s() - begin,
     )  # fmt: skip

@@ -183,12 +183,17 @@ class CholeskyMethod:
 
         self._analyzed = lru_cache(maxsize=1)(analyzed)
 
-    def factorize(self, system: LinearSystem, built: tuple[csc_matrix, NDArray[np.float64]]) -> Factored:
-        """U with AᵀA = UᵀU."""
-        H, g = built
+    def factored(self, system: LinearSystem, H: csc_matrix) -> SparseCholesky:
+        """The factored H = AᵀA of this system."""
         cholesky = self._analyzed(system.pattern)
         H.sum_duplicates()  # sorts it, so that entries are found by bisection
         cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
+        return cholesky
+
+    def factorize(self, system: LinearSystem, built: tuple[csc_matrix, NDArray[np.float64]]) -> Factored:
+        """U with AᵀA = UᵀU."""
+        H, g = built
+        cholesky = self.factored(system, H)
         U, order = upper_factor, cholesky.analysis.order
         return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
 
@@ -235,8 +240,8 @@ def _order_of_rows(pattern: Pattern, place: NDArray[np.int64]) -> NDArray[np.int
 class SchurMethod:
     """Schur complement S = C − B P⁻¹ Bᵀ of AᵀA = [P, Bᵀ; B, C], dense as it couples all landmarks, then poses.
 
-    P is banded, since only odometry joins the poses. If they have fewer unknowns than the landmarks, sparse
-    Cholesky of the whole matrix is faster and is used instead.
+    P is banded if only odometry joins the poses. If robots see each other, or the poses have fewer unknowns than
+    the landmarks, sparse Cholesky of the whole matrix is used instead.
     """
 
     def __init__(self) -> None:
@@ -244,8 +249,9 @@ class SchurMethod:
 
     def build(self, system: LinearSystem) -> tuple[Arrow | csc_matrix, NDArray[np.float64]]:
         """AᵀA, as an arrow where that is faster, and Aᵀb."""
-        split = system.pattern.layout.split
-        return normal_equations(system) if system.pattern.shape[1] > 2 * split else _form(system)
+        layout = system.pattern.layout
+        is_arrow = layout.is_chain and layout.columns <= 2 * layout.split
+        return _form(system) if is_arrow else normal_equations(system)
 
     def factorize(self, system: LinearSystem, built: tuple[Arrow | csc_matrix, NDArray[np.float64]]) -> Factored:
         """U with AᵀA = UᵀU."""
@@ -274,14 +280,10 @@ class Covariance:
     def __init__(self, system: LinearSystem) -> None:
         """Raises UndeterminedError if A lacks full column rank."""
         self._layout = system.pattern.layout
-        U, _ = _form(system)
         try:
-            _eliminate(U)
+            self._inverse = (_ArrowInverse if self._layout.is_chain else _SparseInverse)(system)
         except SingularMatrixError as error:
             raise undetermined(system) from error
-        self._factor = U
-        self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
-        algebra.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
 
     @property
     def poses(self) -> Matrix:
@@ -291,8 +293,8 @@ class Covariance:
     @property
     def calibration(self) -> NDArray[np.float64]:
         """Standard deviations of the calibration, (C,)."""
-        first, last = self._layout.split, self._layout.landmark_start
-        return np.sqrt(self._corner.diagonal()[: last - first])
+        columns = np.arange(self._layout.split, self._layout.landmark_start)
+        return np.sqrt(self.of(columns[:, None])[:, 0, 0])
 
     @property
     def landmarks(self) -> Matrix:
@@ -301,18 +303,64 @@ class Covariance:
 
     def sample(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """A normally distributed step (n,) with this covariance: x = U⁻¹ z for AᵀA = UᵀU."""
-        U, split = self._factor, self._layout.split
-        z = rng.normal(size=self._layout.columns)
+        return self._inverse.draw(rng.normal(size=self._layout.columns))
+
+    def of(self, columns: NDArray[np.int64]) -> Matrix:
+        """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""
+        result = np.empty((*columns.shape, columns.shape[1]))
+        self._inverse.blocks(columns, result)
+        return result
+
+
+class _ArrowInverse:
+    """(AᵀA)⁻¹ in the band of the poses, in its border and in the corner."""
+
+    def __init__(self, system: LinearSystem) -> None:
+        """Raises SingularMatrixError."""
+        self._factor, _ = _form(system)
+        _eliminate(self._factor)
+        U = self._factor
+        self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
+        algebra.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
+
+    def draw(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solution x (n,) of U x = z, in place of z."""
+        U, split = self._factor, self._factor.band.shape[1]
         z[split:] = solve_triangular(U.corner, z[split:], check_finite=False)
         z[:split] -= U.border @ z[split:]
         algebra.solve_backward(U.band, z[:split])
         return z
 
-    def of(self, columns: NDArray[np.int64]) -> Matrix:
-        """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""
-        result = np.empty((*columns.shape, columns.shape[1]))
+    def blocks(self, columns: NDArray[np.int64], result: Matrix) -> None:
+        """Fill the blocks (N, c, c) of these columns (N, c)."""
         algebra.blocks(self._band, self._border, self._corner, columns, result)
-        return result
+
+
+class _SparseInverse:
+    """(AᵀA)⁻¹ where AᵀA may be nonzero."""
+
+    def __init__(self, system: LinearSystem) -> None:
+        """Raises SingularMatrixError."""
+        H, _ = normal_equations(system)
+        self._cholesky = CholeskyMethod().factored(system, H)
+        pattern, inverse = self._cholesky.pattern, self._cholesky.inverse_blocks()
+        self._n = pattern.scalars
+        keys = self._keys(pattern.rows, pattern.columns)
+        order = np.argsort(keys)
+        self._known, self._values = keys[order], inverse[order]
+
+    def _keys(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.minimum(rows, columns) * self._n + np.maximum(rows, columns)
+
+    def draw(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A step (n,) of this covariance for white noise z (n,)."""
+        return self._cholesky.draw(z)
+
+    def blocks(self, columns: NDArray[np.int64], result: Matrix) -> None:
+        """Fill the blocks (N, c, c) of these columns (N, c), with NaN where AᵀA is zero."""
+        keys = self._keys(columns[:, :, None], columns[:, None, :])
+        at = np.minimum(np.searchsorted(self._known, keys), len(self._known) - 1)
+        result[:] = np.where(self._known[at] == keys, self._values[at], np.nan)
 
 
 def _solved(U: Arrow, g: NDArray[np.float64]) -> NDArray[np.float64]:

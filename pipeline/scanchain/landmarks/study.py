@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -27,9 +27,17 @@ from scanchain.landmarks.estimate import (
     minimize,
     of_relative_positions,
 )
-from scanchain.landmarks.files import RangeLog, read_mrclam
+from scanchain.landmarks.files import RangeLog, read_mrclams, robots_of
 from scanchain.landmarks.problem import BearingRangeProblem, LandmarkData, LinearSystem, Values, linear_system
-from scanchain.landmarks.ranges import OWN, OWN_UNITS, WHEELS, OdometryNoise, RangeSolution, solve_range_log
+from scanchain.landmarks.ranges import (
+    OWN,
+    OWN_UNITS,
+    TO_ROBOTS,
+    WHEELS,
+    OdometryNoise,
+    RangeSolution,
+    solve_range_logs,
+)
 from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
 from scanchain.trajectory import write_tum
 
@@ -58,50 +66,60 @@ class Estimate:
 
 def of_positions(state: Values, data: LandmarkData) -> Estimate:
     """Estimate compared with the true positions of an npz file, if it has them; both are in the same frame."""
-    known = len(data.true_poses) > 0
-    if not known and np.isnan(data.true_landmarks).all():
+    if np.isnan(data.true_poses).all() and np.isnan(data.true_landmarks).all():
         return Estimate(state, lie.identity(2), np.nan, np.nan, "no true positions in the file")
-    poses_m = _rms(state.poses - data.true_poses) if known else np.nan
+    errors_m = _rms(state.poses - data.true_poses), _rms(state.landmarks - data.true_landmarks)
     definition = "root mean squared distance from the true positions, nothing aligned"
-    return Estimate(state, lie.identity(2), poses_m, _rms(state.landmarks - data.true_landmarks), definition)
+    return Estimate(state, lie.identity(2), *errors_m, definition)
 
 
 def against_truth(
-    states: Sequence[Values], nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64] | None, log: RangeLog
+    states: Sequence[Values],
+    nodes_s: Sequence[NDArray[np.float64]],
+    landmarks: NDArray[np.int64] | None,
+    logs: Sequence[RangeLog],
 ) -> tuple[list[Estimate], Matrix, Matrix]:
     """Estimates with ATE against motion capture after rigid alignment, which is applied to the landmarks as well.
 
-    nodes_s, landmarks : (K,) times of the poses, (L,) numbers of the landmarks; None where these are not known and
-        each is compared with the surveyed one nearest to it in the last state
-    Also returns the true positions (k, 2) of poses, and (L, 2) of landmarks, NaN for those not surveyed.
+    nodes_s : (K,) times of the poses of each robot
+    landmarks : (L,) their numbers; None where these are not known and each is compared with the surveyed one
+        nearest to it in the last state
+    Also returns the true positions (K, 2) of poses and (L, 2) of landmarks, NaN where unknown.
     """
-    place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
+    place, unknown = dict[int, NDArray[np.float64]](), np.full(2, np.nan)
+    for log in logs:
+        place |= zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)
     surveyed = np.full_like(states[0].landmarks, np.nan)
     if landmarks is not None:
         surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
-    truth, estimates = _trajectory(log.true_s, log.true_poses), list[Estimate]()
+    truth = _trajectory([log.true_s for log in logs], np.concatenate([log.true_poses for log in logs]))
+    true_poses, estimates = np.full_like(states[0].poses[:, :2], np.nan), list[Estimate]()
     try:
         pairs = [pair(_trajectory(nodes_s, each.poses), truth, gap_s=_WIDEST_GAP_S) for each in states]
         errors = [absolute_error(each, Alignment.RIGID) for each in pairs]
     except InputError:
         why = "no motion capture at these times"
         estimates += [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states]
-        return estimates, np.empty((0, 2)), surveyed
+        return estimates, true_poses, surveyed
+    true_poses[pairs[0].places] = pairs[0].reference[:, :2, 3]
     if landmarks is None and place:
-        T_truth_estimate = lie.flatten(errors[-1].T_reference_estimate)
-        _, nearest = KDTree(log.true_landmarks).query(lie.transform(T_truth_estimate, states[-1].landmarks))
-        surveyed = log.true_landmarks[nearest]
+        T_truth_estimate, known = lie.flatten(errors[-1].T_reference_estimate), np.array([*place.values()])
+        surveyed = known[KDTree(known).query(lie.transform(T_truth_estimate, states[-1].landmarks))[1]]
     for state, error in zip(states, errors, strict=True):
         T_truth_estimate = lie.flatten(error.T_reference_estimate)
         landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)
         definition = f"{error.definition}, over {error.pairing}"
         estimates.append(Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition))
-    return estimates, pairs[0].reference[:, :2, 3], surveyed
+    return estimates, true_poses, surveyed
 
 
-def _trajectory(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
-    """Poses x, y, heading (K, 3) at times that were logged in milliseconds."""
-    stamps_ns = np.round(nodes_s * 1e3).astype(np.int64) * 1_000_000
+_APART_S = 1e6  # time that puts one robot's poses behind those of another, for their common alignment
+
+
+def _trajectory(times_s: Sequence[NDArray[np.float64]], poses: Matrix) -> Trajectory:
+    """Poses x, y, heading (K, 3) of one robot after the other, at times that were logged in milliseconds."""
+    apart_s = np.concatenate([each + _APART_S * robot for robot, each in enumerate(times_s)])
+    stamps_ns = np.round(apart_s * 1e3).astype(np.int64) * 1_000_000
     return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]).reshape(-1, 3, 3))
 
 
@@ -121,13 +139,14 @@ class Options:
     """Options of a study.
 
     ``methods`` are the linear solvers by name, or "all"; the first one makes the estimate of a file.
-    ``robot``, ``noise`` and ``ignore_barcodes`` are for MRCLAM folders; the noise is estimated if it is None.
+    ``robots``, ``noise`` and ``ignore_barcodes`` are for MRCLAM folders: all robots if none is named; the noise is
+    estimated if it is None.
     ``guess`` and ``optimizer`` are for nonlinear files.
     """
 
     methods: tuple[str, ...]
     repeats: int
-    robot: int
+    robots: tuple[int, ...]
     noise: OdometryNoise | None
     guess: Literal["odometry", "disturbed", "origin"]
     optimizer: Optimizer
@@ -140,10 +159,10 @@ class Study:
 
     facts : descriptive lines by label
     covariance : after optimization
-    true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown
+    true_poses, true_landmarks : (K, 2), (L, 2) m, NaN where unknown
     system, build_s : A x = b as the methods solved it, and the time to assemble it
     converged : False also if landmarks are contradicted
-    trajectory : the poses after optimization with their stamps; None for a file, which has no stamps
+    trajectories : by robot, the poses after optimization with their stamps; none for a file, which has no stamps
     contradicted : landmarks found without barcodes that are missed on more visits than seen
     """
 
@@ -158,8 +177,13 @@ class Study:
     system: LinearSystem
     build_s: float
     methods: tuple[MethodResult, ...]
-    trajectory: Trajectory | None = None
+    trajectories: dict[int, Trajectory] = field(default_factory=dict[int, Trajectory])
     contradicted: tuple[int, ...] = ()
+
+    def paths(self, points: Matrix) -> list[Matrix]:
+        """Points of all poses, (K, 2), split by robot."""
+        counts = [len(each) for each in self.trajectories.values()]
+        return np.split(points, np.cumsum(counts)[:-1])
 
 
 def study_file(data: LandmarkData, options: Options) -> Study:
@@ -238,70 +262,104 @@ def study_log(folder: Path, options: Options) -> Study:
     The requested linear solvers are compared on the first step from the initial guess, with the estimated noise;
     ``ESTIMATOR`` makes the estimate.
     """
-    log = given = read_mrclam(folder, options.robot)
+    robots = options.robots or robots_of(folder) or (1,)
+    if options.ignore_barcodes and len(robots) > 1:
+        raise InputError("--ignore-barcodes is for one robot; name it with --robot")
+    given = read_mrclams(folder, robots)
     if options.ignore_barcodes:
-        log, solution = associated(log, options.noise)
+        log, solution = associated(given[0], options.noise)
+        logs = [log]
     else:
-        solution = solve_range_log(log, options.noise)
+        logs, solution = given, solve_range_logs(given, options.noise)
     begin = working_s()
     at = solution.problem.linearize(solution.guess)
     system = solution.problem.system(at, solution.loss.weight(at.chi2))
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
-    facts = _facts(log, solution, is_stated=options.noise is not None) | left_out
-    minimum, nodes_s, contradicted = solution.minimum, solution.nodes_s, tuple[int, ...]()
+    facts = _facts(logs, solution, is_stated=options.noise is not None) | left_out
+    minimum, contradicted = solution.minimum, tuple[int, ...]()
+    nodes_s = np.split(solution.nodes_s, solution.problem.measurements.starts[1:])
     states, landmarks = (solution.reckoned, minimum.estimate.state), system.pattern.layout.landmarks
     if options.ignore_barcodes:
-        seen, missed = visits(log, solution)
+        seen, missed = visits(logs[0], solution)
         contradicted = tuple(landmarks[missed > seen].tolist())
-        left = counted(len(given.seen_s) - len(log.seen_s), "sighting")
+        left = counted(len(given[0].seen_s) - len(logs[0].seen_s), "sighting")
         facts["association"] = f"without barcodes: {len(landmarks)} landmarks; {left} of none of them"
     if contradicted:
         which = f"{counted(len(contradicted), 'landmark')} ({', '.join(map(str, contradicted))})"
         facts["CONTRADICTED"] = f"{which} not seen on most visits: duplicates, or poses that are wrong"
     named = None if options.ignore_barcodes else landmarks
-    (before, after), true_poses, surveyed = against_truth(states, nodes_s, named, log)
+    (before, after), true_poses, surveyed = against_truth(states, nodes_s, named, logs)
+    poses = np.split(minimum.estimate.state.poses, solution.problem.measurements.starts[1:])
+    name = logs[0].name if len(logs) == 1 else f"{folder.resolve().name} robots {', '.join(map(str, robots))}"
     return Study(
-        log.name, facts, before, after, minimum.converged and not contradicted, solution.covariance, true_poses,
+        name, facts, before, after, minimum.converged and not contradicted, solution.covariance, true_poses,
         surveyed, system, build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
-        _trajectory(nodes_s, minimum.estimate.state.poses), contradicted,
+        {log.robot: _trajectory([times_s], own) for log, times_s, own in zip(logs, nodes_s, poses, strict=True)},
+        contradicted,
     )  # fmt: skip
 
 
-def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[str, str]:
+def _facts(logs: Sequence[RangeLog], solution: RangeSolution, *, is_stated: bool) -> dict[str, str]:
     noise, estimate, share = solution.consistency, solution.minimum.estimate, solution.loss.share
-    nodes = counted(len(solution.nodes_s), "pose")
-    forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m, range_share = solution.sigmas
-    wheels = (
-        f"{forward_m:.3g} m forward, {sideways_m:.3g} m sideways, {drift_rad:.3g} rad"
-        f" after a meter, {turn_rad:.3g} rad after a radian"
-    )
+    wheels, sensors = solution.sigmas
+    unknowns = len(estimate.state.calibration) // len(logs)
+    names, units = ((each * len(logs)) for each in ((*OWN, TO_ROBOTS)[:unknowns], OWN_UNITS[:unknowns]))
     own = [
         f"{name} {value:+.3f} ± {sigma:.3f}{unit}"
         for name, value, sigma, unit in zip(
-            OWN, estimate.state.calibration, solution.covariance.calibration, OWN_UNITS, strict=True
+            names, estimate.state.calibration, solution.covariance.calibration, units, strict=True
         )
     ]
-    found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m and {range_share:.2%} (Student's t)"
     downweighted = int(np.count_nonzero(estimate.weights < _DOWNWEIGHTED * share))
     state, sensor = "stated" if is_stated else "estimated", noise.sensor / noise.sensor_freedom
+    of_wheels, of_sensors = list(map(_wheel_noise, wheels)), list(map(_sensor_noise, sensors))
+    fits = _verdict(noise.motion / noise.motion_freedom), _verdict(sensor)
+    if len(logs) == 1:
+        of_robots = {
+            "robot": f"estimated: {', '.join(own[:WHEELS])}",
+            "sensor": f"estimated: {', '.join(own[WHEELS:])}",
+            "odometry noise": f"{state}: {of_wheels[0]}; {fits[0]}",
+            "sensor noise": f"estimated: {of_sensors[0]} (Student's t); {fits[1]}",
+        }
+    else:
+        of_robots = {
+            f"robot {log.robot}": f"estimated: {', '.join(own[k * unknowns : (k + 1) * unknowns])}; "
+            f"noise: {of_wheels[k]}; {of_sensors[k]} (Student's t)"
+            for k, log in enumerate(logs)
+        }
+        met = f"of robots {of_sensors[-1]}; " if len(sensors) > len(logs) else ""
+        of_robots |= {"odometry noise": f"{state}: {fits[0]}", "sensor noise": f"estimated: {met}{fits[1]}"}
+    nodes, met = counted(len(solution.nodes_s), "pose"), sum(int((log.subjects < 0).sum()) for log in logs)
+    of_others, unknown, outside = (
+        sum(counts) for counts in zip(*((log.of_robots, log.unknown, log.outside) for log in logs), strict=True)
+    )
     return {
         "observations": (
-            f"{len(log.seen_s):,} of {len(estimate.state.landmarks)} landmarks from {nodes}; they count as "
+            f"{len(share) - met:,} of {len(estimate.state.landmarks)} landmarks"
+            f"{f' and {met:,} of robots' if met else ''} from {nodes}; they count as "
             f"{share.sum():.0f}, as errors of a landmark's successive sightings are correlated"
         ),
-        "left out": (
-            f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
-        ),
+        "left out": f"{of_others} of other robots, {unknown} of unknown barcodes, {outside} without odometry",
         "estimate": f"{1e3 * solution.time_s:.0f} ms, {_ended(solution.minimum, solution.iterations)}",
-        "robot": f"estimated: {', '.join(own[:WHEELS])}",
-        "sensor": f"estimated: {', '.join(own[WHEELS:])}",
-        "odometry noise": f"{state}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
-        "sensor noise": f"estimated: {found}; {_verdict(sensor)}",
+        **of_robots,
         "downweighted": (
             f"{counted(downweighted, 'observation')} with less than {_DOWNWEIGHTED:g} of the weight of others"
         ),
     }
+
+
+def _wheel_noise(sigmas: NDArray[np.float64]) -> str:
+    forward_m, sideways_m, drift_rad, turn_rad = sigmas
+    return (
+        f"{forward_m:.3g} m forward, {sideways_m:.3g} m sideways, {drift_rad:.3g} rad"
+        f" after a meter, {turn_rad:.3g} rad after a radian"
+    )
+
+
+def _sensor_noise(sigmas: NDArray[np.float64]) -> str:
+    bearing_rad, range_m, range_share = sigmas
+    return f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m and {range_share:.2%}"
 
 
 def _verdict(chi2: float) -> str:
@@ -387,13 +445,16 @@ def tree_of(study: Study) -> dict[str, object]:
 
 
 def write_estimate(directory: Path, study: Study) -> None:
-    """Poses and landmarks with their covariances as CSV, and the poses as TUM where they have stamps."""
+    """Poses and landmarks with their covariances as CSV, and the poses as TUM where they have stamps, by robot."""
     stem, state, covariance = directory / file_stem(study.name), study.after.state, study.covariance
-    _write_csv(f"{stem}_poses.csv", "pose", np.arange(len(state.poses)), state.poses, covariance.poses)
+    parts = zip(study.trajectories or (0,), study.paths(state.poses), study.paths(covariance.poses), strict=True)
+    for robot, poses, covariances in parts:
+        path = f"{stem}_robot_{robot}" if len(study.trajectories) > 1 else f"{stem}"
+        _write_csv(f"{path}_poses.csv", "pose", np.arange(len(poses)), poses, covariances)
+        if robot in study.trajectories:
+            write_tum(Path(f"{path}.tum"), study.trajectories[robot], force=True)
     names = study.system.pattern.layout.landmarks
     _write_csv(f"{stem}_landmarks.csv", "landmark", names, state.landmarks, covariance.landmarks)
-    if study.trajectory is not None:
-        write_tum(Path(f"{stem}.tum"), study.trajectory, force=True)
 
 
 def _write_csv(path: str, kind: str, numbers: np.ndarray, values: Matrix, covariance: Matrix) -> None:

@@ -263,12 +263,13 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
 def _study(root: str, study: Study) -> Iterator[Message]:
     """The true trajectory and landmarks, static, and the estimates at their instants."""
     known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
-    path = drawing.lines([drawing.in_space(study.true_poses)], entities.Color.GRAY, 1.0)
+    paths = [each[np.isfinite(each).all(axis=1)] for each in study.paths(study.true_poses)]
+    path = drawing.lines(list(map(drawing.in_space, paths)), entities.Color.GRAY, 1.0)
     yield Message(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     yield Message(f"{root}/truth/trajectory", path)
     yield Message(f"{root}/truth/landmarks", drawing.dots(drawing.in_space(known), entities.Color.GRAY, 4.0))
-    yield from _estimate(root, study.before, Times.at(0, 0), entities.Color.ORANGE)
-    yield from _estimate(root, study.after, Times.at(1, 1), entities.Color.BLUE)
+    yield from _estimate(root, study, study.before, Times.at(0, 0), entities.Color.ORANGE)
+    yield from _estimate(root, study, study.after, Times.at(1, 1), entities.Color.BLUE)
     axes_m, angles_rad = problems.ellipses(study)
     drawn = rr.Ellipsoids3D.from_fields(
         centers=drawing.in_space(study.after.in_truth()[1]),
@@ -279,8 +280,11 @@ def _study(root: str, study: Study) -> Iterator[Message]:
     yield Message(f"{root}/ellipses", drawn, Times.at(1, 1))
 
 
-def _estimate(root: str, estimate: Estimate, times: Times, color: drawing.Color) -> Iterator[Message]:
-    """Trajectory and landmarks at one instant."""
-    path, points = map(drawing.in_space, estimate.in_truth())
-    yield Message(f"{root}/trajectory", drawing.lines([path], color, 1.5), times)
-    yield Message(f"{root}/landmarks", drawing.dots(points, color, 3.0), times)
+def _estimate(
+    root: str, study: Study, estimate: Estimate, times: Times, color: drawing.Color
+) -> Iterator[Message]:
+    """Trajectories and landmarks at one instant."""
+    poses, points = estimate.in_truth()
+    paths = list(map(drawing.in_space, study.paths(poses)))
+    yield Message(f"{root}/trajectory", drawing.lines(paths, color, 1.5), times)
+    yield Message(f"{root}/landmarks", drawing.dots(drawing.in_space(points), color, 3.0), times)

@@ -80,13 +80,18 @@ def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     points = [study.true_poses, study.true_landmarks, *study.before.in_truth(), *study.after.in_truth()]
     figure = Plot.of_plan(*around(np.concatenate(points)))
     poses, landmarks = estimate.in_truth()
-    if len(study.true_poses):
-        figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
-    figure.line(poses, f"{color}d9", name=f"trajectory {when}")
+    if np.isfinite(study.true_poses).any():
+        figure.line(_by_robot(study, study.true_poses), INK, 1.1, (4.0, 2.0), name="true trajectory")
+    figure.line(_by_robot(study, poses), f"{color}d9", name=f"trajectory {when}")
     if np.isfinite(study.true_landmarks).any():
         figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
     figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")
     return figure
+
+
+def _by_robot(study: Study, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points of all poses as one line, broken between robots."""
+    return np.concatenate([np.pad(each, ((0, 1), (0, 0)), constant_values=np.nan) for each in study.paths(points)])
 
 
 def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -139,7 +144,7 @@ def _estimate_section(study: Study, before: Plot, after: Plot) -> page.Section:
     facts = [("error before, rmse", error_before), ("error after, rmse", error_after)]
     facts += study.facts.items()
     chips, marks = [page.Chip("before", BEFORE), page.Chip("after", AFTER)], "Circles: landmarks"
-    if len(study.true_poses) or np.isfinite(study.true_landmarks).any():
+    if np.isfinite(study.true_poses).any() or np.isfinite(study.true_landmarks).any():
         chips.append(page.Chip("truth", INK, is_dashed=True))
         marks += "; crosses: true ones"
     drawings = (

@@ -75,19 +75,21 @@ def bearing_range(
 
 
 @njit()
-def odometry(poses: _Array, moved: _Array, whitening: _Array, residuals: _Array, jacobians: _Array) -> None:
+def odometry(
+    poses: _Array, before: _Index, moved: _Array, whitening: _Array, residuals: _Array, jacobians: _Array
+) -> None:
     """Fill W r and W J of every motion from a pose to the next, measured in the frame of the first.
 
         r = [Rᵀ(θ_i) (t_j − t_i) − t_z, wrap(θ_j − θ_i − θ_z)]
         ∂r/∂(t_i, θ_i) = [−Rᵀ, (∂Rᵀ/∂θ_i)(t_j − t_i); 0, −1],  ∂r/∂(t_j, θ_j) = [Rᵀ, 0; 0, 1]
 
-    poses (K, 3) and moved (K − 1, 3) x, y, heading; m, rad; whitening (K − 1, 3, 3) W
-    residuals (K − 1, 3), jacobians (K − 1, 3, 6) : filled
+    poses (K, 3), moved (M, 3) x, y, heading; m, rad; before (M,) pose that each motion starts from
+    whitening (M, 3, 3) W; residuals (M, 3), jacobians (M, 3, 6) : filled
     """
     r, J = np.empty(3), np.zeros((3, 6))
     J[2, 2], J[2, 5] = -1.0, 1.0
     for k in range(moved.shape[0]):
-        first, second = poses[k], poses[k + 1]
+        first, second = poses[before[k]], poses[before[k] + 1]
         c, s = np.cos(first[2]), np.sin(first[2])
         dx, dy = second[0] - first[0], second[1] - first[1]
         turn = second[2] - first[2] - moved[k, 2]
