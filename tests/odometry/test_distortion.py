@@ -119,6 +119,14 @@ def test_times_by_azimuth_are_not_adopted_where_opposite_ones_explain_the_scans_
         assert spinning.is_shown == rosette.is_shown == (loss == 0.3) and rosette.share == 1.0
 
 
+@pytest.mark.parametrize(("gain", "said"), [(0.1, "which point times remove"), (-0.1, "but do not explain it")])
+def test_times_of_a_log_are_said_to_remove_distortion_only_if_residuals_are_smaller_with_them(gain, said):
+    log = open_log(made.log("office", seconds=SECONDS))
+    found = Distortion(0.1, "at 1 m/s", log.config, True, gain=gain, loss=0.2, sigmas=1.0, is_spinning=False)
+    words, remedy = found.advice(log)
+    assert words.endswith(said) and not remedy
+
+
 def test_scans_that_a_run_does_not_deskew_count_as_distorted_as_far_as_they_are():
     town = made.log("town", seconds=SECONDS, sensor="os1-32")
     shares = []
