@@ -89,8 +89,8 @@ class Distortion:
         if self.is_removed(log) and self.is_given and self.is_refuted:
             return "scans fit better without their point times", "--log.point_times none"
         if self.is_removed(log):
-            effect = "which point times remove" if self.gain > 0.0 else "point times are used, but do not explain it"
-            return f"scans are {size}, {effect}", ""
+            explained = "which point times remove", "point times are used, but do not explain it"
+            return f"scans are {size}, {explained[self.gain <= 0.0]}", ""
         if self.is_refuted:
             may_be = f"scans may be {size}, but times by azimuth do not explain it"
             return f"{lack}: {'scans show no distortion' if self.is_spinning else may_be}", ""
