@@ -29,7 +29,7 @@ import gtsam
 import numpy as np
 
 from scanchain.graph.losses import RobustLoss
-from scanchain.landmarks.association import associated, visits
+from scanchain.landmarks.association import associated, contradicted
 from scanchain.landmarks.estimate import from_odometry, minimize
 from scanchain.landmarks.files import read_landmark_data, read_mrclam, read_mrclams
 from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
@@ -235,11 +235,10 @@ def without_barcodes(options):
     def found(name, log):
         part, solution = associated(log, None)
         ((accuracy,), *_) = against_truth((solution.minimum.estimate.state,), [solution.nodes_s], None, [log])
-        seen, missed = visits(part, solution)
-        count, contradicted = len(seen), np.count_nonzero(missed > seen)
+        count, wrong = len(solution.problem.measurements.landmarks), len(contradicted(part, solution))
         logged = len(np.unique(log.subjects))
-        row(name, f"{accuracy.poses_m:.3f}", count, logged, len(log.seen_s) - len(part.seen_s), contradicted)
-        verdicts.append((accuracy.poses_m > LOST_M, count > logged, contradicted > 0))
+        row(name, f"{accuracy.poses_m:.3f}", count, logged, len(log.seen_s) - len(part.seen_s), wrong)
+        verdicts.append((accuracy.poses_m > LOST_M, count > logged, wrong > 0))
 
     log = read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot)
     is_early = log.seen_s < np.median(log.seen_s)

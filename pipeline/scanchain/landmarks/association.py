@@ -83,6 +83,15 @@ def visits(part: RangeLog, solution: RangeSolution) -> NDArray[np.int64]:
     return np.array([np.bincount(of[is_long & each], minlength=len(seen)) for each in (is_seen, ~is_seen)])
 
 
+def contradicted(part: RangeLog, solution: RangeSolution) -> NDArray[np.int64]:
+    """Landmarks that are missed on at least two visits more than they are seen on: duplicates, or poses are wrong.
+
+    One visit more is no evidence, as landmarks that stand side by side hide each other.
+    """
+    seen, missed = visits(part, solution)
+    return solution.problem.measurements.landmarks[missed > seen + 1]
+
+
 def _missed_share(found: tuple[RangeLog, RangeSolution]) -> float:
     """Share of the visits on which the landmark is missed."""
     seen, missed = visits(*found).sum(axis=1)

@@ -18,7 +18,7 @@ from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import FREEDOM, InputError, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
-from scanchain.landmarks.association import associated, visits
+from scanchain.landmarks.association import associated, contradicted
 from scanchain.landmarks.estimate import (
     Minimum,
     Optimizer,
@@ -163,7 +163,7 @@ class Study:
     system, build_s : A x = b as the methods solved it, and the time to assemble it
     converged : False also if landmarks are contradicted
     trajectories : by robot, the poses after optimization with their stamps; none for a file, which has no stamps
-    contradicted : landmarks found without barcodes that are missed on more visits than seen
+    contradicted : landmarks found without barcodes that are missed on most visits
     """
 
     name: str
@@ -277,26 +277,25 @@ def study_log(folder: Path, options: Options) -> Study:
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     facts = _facts(logs, solution, is_stated=options.noise is not None) | left_out
-    minimum, contradicted = solution.minimum, tuple[int, ...]()
+    minimum, wrong = solution.minimum, tuple[int, ...]()
     nodes_s = np.split(solution.nodes_s, solution.problem.measurements.starts[1:])
     states, landmarks = (solution.reckoned, minimum.estimate.state), system.pattern.layout.landmarks
     if options.ignore_barcodes:
-        seen, missed = visits(logs[0], solution)
-        contradicted = tuple(landmarks[missed > seen].tolist())
+        wrong = tuple(contradicted(logs[0], solution).tolist())
         left = counted(len(given[0].seen_s) - len(logs[0].seen_s), "sighting")
         facts["association"] = f"without barcodes: {len(landmarks)} landmarks; {left} of none of them"
-    if contradicted:
-        which = f"{counted(len(contradicted), 'landmark')} ({', '.join(map(str, contradicted))})"
+    if wrong:
+        which = f"{counted(len(wrong), 'landmark')} ({', '.join(map(str, wrong))})"
         facts["CONTRADICTED"] = f"{which} not seen on most visits: duplicates, or poses that are wrong"
     named = None if options.ignore_barcodes else landmarks
     (before, after), true_poses, surveyed = against_truth(states, nodes_s, named, logs)
     poses = np.split(minimum.estimate.state.poses, solution.problem.measurements.starts[1:])
     name = logs[0].name if len(logs) == 1 else f"{folder.resolve().name} robots {', '.join(map(str, robots))}"
     return Study(
-        name, facts, before, after, minimum.converged and not contradicted, solution.covariance, true_poses,
+        name, facts, before, after, minimum.converged and not wrong, solution.covariance, true_poses,
         surveyed, system, build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
         {log.robot: _trajectory([times_s], own) for log, times_s, own in zip(logs, nodes_s, poses, strict=True)},
-        contradicted,
+        wrong,
     )  # fmt: skip
 
 
