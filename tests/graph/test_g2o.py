@@ -147,6 +147,14 @@ def test_a_file_without_vertices_starts_from_its_odometry():
     assert np.allclose(relative, graph.measurements[steps], atol=1e-9)
 
 
+def test_a_graph_of_priors_alone_is_read_as_graph_rejected_may_be_one(tmp_path):
+    path, prior = tmp_path / "priors.g2o", "EDGE_PRIOR_SE2 1 1.5 0 0 1 0 0 1 0 1\n"
+    path.write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n{prior}")
+    with pytest.warns(UserWarning, match="with 0 fixed"):
+        graph = read_g2o(path).graph
+    assert graph.edges.tolist() == [[-1, 1]] and graph.is_of_origin.all() and graph.measurements[0, 0, 2] == 1.5
+
+
 def test_suspect_loops_are_the_edges_that_skip_poses():
     graph = read_g2o(shared_data("graphs/intel.g2o"), loops="robust").graph
     apart = np.abs(graph.edges[:, 0] - graph.edges[:, 1])
@@ -161,6 +169,7 @@ EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"
     [
         ("", "holds no EDGE_SE2"),
         ("VERTEX_SE2 0 0 0 0\n", "holds no EDGE_SE2"),
+        ("EDGE_PRIOR_SE2 0 0 0 0 1 0 0 1 0 1\n", "holds no EDGE_SE2"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n", r":1: EDGE_SE2 has 10 values, needs 11"),
         (f"{EDGE}\nEDGE_SE2 1 two 1 0 0 1 0 0 1 0 1\n", r":2: EDGE_SE2: vertex id 'two' is not a 64-bit integer"),
         (f"{EDGE}\nEDGE_SE2 1 2 1 0 zero 1 0 0 1 0 1\n", r":2: EDGE_SE2: could not convert"),

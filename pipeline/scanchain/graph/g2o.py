@@ -191,7 +191,7 @@ class Lines:
         if again := len(edges) - len({(tag, *names, *numbers) for _, tag, names, numbers in edges}):
             self.notes.append(f"{path}: {counted(again, 'edge')} repeated to the digit; each counts in full")
         self._separate_landmarks()
-        if not edges:
+        if not edges and not (priors and vertices):
             what = f"its first line is {self.others[0][:40]!r}; " if self.others else ""
             what += "is it a g2o pose graph?"
             if any(line.split(maxsplit=1)[0] in _LIBRSF for line in self.others):
