@@ -65,4 +65,6 @@ def test_a_scan_of_which_nothing_matches_is_lost_and_its_pose_is_predicted():
     scans = [Scan.of(points, 0.1 * k) for k, points in enumerate([*seen, 0.05 * seen[-1][:60]])]
     *_, known, lost = (localizer.process(scan) for scan in scans)
     assert (known.state, lost.state) == (MapState.LOCALIZED, MapState.LOST)
+    sigma_m = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in (known, lost)]
+    assert sigma_m[0] < 0.02 and sigma_m[1] > 1.0  # as of the edge to a keyframe after a lost scan
     assert lie.apart(lost.T_map_lidar, prior.poses[10])[0] < 0.01

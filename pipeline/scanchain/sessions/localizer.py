@@ -15,6 +15,7 @@ from scanchain.config import Config
 from scanchain.data import Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
 from scanchain.errors import counted
 from scanchain.evaluation.consistency import edge_errors, with_map_errors
+from scanchain.graph.odometry_errors import JUMP_SIGMAS
 from scanchain.loops.evidence import is_in_sight
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.placement import loop_information
@@ -189,6 +190,8 @@ class Localizer:
             self._follow()
         T_map_lidar = placement.T_world_odom @ step.T_odom_lidar
         covariance = _moved(self.covariance, self.slam.keyframes[-1], step.T_odom_lidar) + self.own
+        jump = self.slam.front_end.lost * np.array(JUMP_SIGMAS)  # by scans lost since the keyframe
+        covariance += np.diag(lie.by_component(len(covariance), *jump) ** 2)
         return Placed(MapState.LOST if step.state is State.LOST else self.state, T_map_lidar, covariance, step)
 
     def _follow(self) -> None:
