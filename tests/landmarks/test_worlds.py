@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scanchain import lie
 from scanchain.errors import InputError
-from scanchain.landmarks.association import _filtered, _settled, associated, contradicted, visits
+from scanchain.landmarks.association import _filtered, _inverse, _settled, associated, contradicted, visits
 from scanchain.landmarks.files import read_mrclam
 from scanchain.landmarks.ranges import OWN, WHEELS, solve_range_log
 from tests.support.mrclam import World, write_mrclam
@@ -66,8 +67,9 @@ def test_without_barcodes_the_landmarks_and_their_number_are_found(tmp_path, wor
     assert nees(solution, truth_at(log, solution.nodes_s), landmarks, 0.005).ate_m < 0.15
 
 
-def test_a_log_that_the_filter_loses_with_the_priors_is_found_with_the_errors_of_short_tracks(tmp_path):
-    write_mrclam(tmp_path / "world", World(5, duration_s=450.0))
+@pytest.mark.parametrize("seed", [5, 12])
+def test_a_log_that_the_filter_loses_with_the_priors_is_found_with_better_errors_or_from_its_end(tmp_path, seed):
+    write_mrclam(tmp_path / "world", World(seed, duration_s=450.0))
     log = read_mrclam(tmp_path / "world", 1)
     lost, found = _settled(log, None, _filtered(log, None, None)), associated(log, None)
     (_, missed), (_, missed_then) = visits(*lost), visits(*found)
@@ -75,6 +77,16 @@ def test_a_log_that_the_filter_loses_with_the_priors_is_found_with_the_errors_of
     for (_, solution), is_lost in ((lost, True), (found, False)):
         landmarks = np.full((len(solution.problem.measurements.landmarks), 2), np.nan)
         assert (nees(solution, truth_at(log, solution.nodes_s), landmarks, 0.005).ate_m > 0.2) == is_lost
+
+
+def test_inverse_motions_and_their_jacobians_are_those_of_their_poses():
+    motion = np.random.default_rng(0).normal(size=(5, 3))
+    inverse, J = _inverse(motion)
+    there, back = (np.array([lie.pose_2d(*each) for each in moves]) for moves in (motion, inverse))
+    assert np.allclose(there @ back, np.eye(3))
+    for column, step in enumerate(1e-6 * np.eye(3)):
+        ahead, behind = (_inverse(motion + sign * step)[0] for sign in (1.0, -1.0))
+        assert np.allclose(J[:, :, column], (ahead - behind) / 2e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("world", [{}, {"landmarks": 6}, {"noise": 2.0}])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import combinations, permutations
 
 import numpy as np
@@ -50,19 +49,40 @@ def associated(log: RangeLog, noise: OdometryNoise | None) -> tuple[RangeLog, Ra
     The filter decides on the sightings of an instant jointly (Neira & Tardós 2001): as many compatible ones as
     possible, then the least χ²; those on which the second-best hypothesis is almost as good are left open. Every
     sighting is then associated again with landmarks of the batch estimate, or with a new one, and landmarks that
-    are the same are merged, until nothing changes or a few times. If landmarks are missed where they should be in
-    view, the filter begins again with better systematic errors: those of short tracks, on which no landmark is
-    recognized again, then those of the estimate; the one with the least share of missed visits is returned. Raises
-    InputError if no landmark is seen again.
+    are the same are merged, until nothing changes or a few times. As long as landmarks are missed where they
+    should be in view, the filter begins again, with better systematic errors, then at the end of the log; the
+    estimate with the least share of missed visits is returned. Raises InputError if no landmark is seen again.
     """
-    subjects = _filtered(log, noise, None)
-    best = _settled(log, noise, subjects)
-    for is_local in (True, False):
-        if _missed_share(best) > 0.0:
-            with suppress(InputError):
-                start = solve_range_log(_with(log, _tracks(log, subjects)), noise) if is_local else best[1]
-                best = min(best, _settled(log, noise, _filtered(log, noise, start)), key=_missed_share)
+    best: tuple[RangeLog, RangeSolution] | None = None
+    for is_backward in (False, True):
+        try:
+            for found in _attempts(log, noise, is_backward=is_backward):
+                best = found if best is None else min(best, found, key=_missed_share)
+                if _missed_share(best) == 0.0:
+                    return best
+        except InputError:
+            if best is None:
+                raise
+    assert best is not None
     return best
+
+
+def _attempts(
+    log: RangeLog, noise: OdometryNoise | None, *, is_backward: bool
+) -> Iterator[tuple[RangeLog, RangeSolution]]:
+    """Estimates with systematic errors in the filter by their priors, by short tracks, and as estimated before.
+
+    On short tracks no landmark is recognized again, so that wrong associations cannot distort the errors.
+    """
+    subjects = _filtered(log, noise, None, is_backward=is_backward)
+    found = [_settled(log, noise, subjects)]
+    yield found[0]
+    for is_local in (True, False):
+        start = min(found, key=_missed_share)[1]
+        if is_local:
+            start = solve_range_log(_with(log, _tracks(log, subjects)), noise)
+        found.append(_settled(log, noise, _filtered(log, noise, start, is_backward=is_backward)))
+        yield found[-1]
 
 
 def visits(part: RangeLog, solution: RangeSolution) -> NDArray[np.int64]:
@@ -188,10 +208,13 @@ def _residuals(state: Values, nodes: NDArray[np.int64], measured: Matrix) -> tup
     return r.reshape(*shape, 2), J.reshape(*shape, 2, 11)
 
 
-def _filtered(log: RangeLog, noise: OdometryNoise | None, start: RangeSolution | None) -> NDArray[np.int64]:
+def _filtered(
+    log: RangeLog, noise: OdometryNoise | None, start: RangeSolution | None, *, is_backward: bool = False
+) -> NDArray[np.int64]:
     """Landmark of every sighting by the filter, (N,); 0 where it is left open.
 
     start : solution with the systematic errors and the noise of the sensor to begin with; None for their priors
+    is_backward : whether it runs from the end of the log to its beginning
     """
     own, sigma, sensor = np.zeros(len(OWN)), PRIOR_SIGMA, SENSOR
     if start is not None:
@@ -200,12 +223,17 @@ def _filtered(log: RangeLog, noise: OdometryNoise | None, start: RangeSolution |
     nodes_s, node = np.unique(log.seen_s, return_inverse=True)
     reckoning, now = reckon(log, nodes_s, own[:WHEELS]), _Filter(own, sigma)
     motion = reckoning.motion - reckoning.slope @ own[:WHEELS]  # without these errors, as linearized there
-    covariance = reckoning.covariance((noise or OdometryNoise()).densities)
+    slope, covariance = reckoning.slope, reckoning.covariance((noise or OdometryNoise()).densities)
     variances = _INFLATION * sensor @ units_of_noise(log.measured)
     subjects = np.zeros(len(node), np.int64)
-    for k, seen in enumerate(np.split(np.arange(len(node)), np.flatnonzero(np.diff(node)) + 1)):
+    instants = np.split(np.arange(len(node)), np.flatnonzero(np.diff(node)) + 1)
+    if is_backward:
+        instants.reverse()
+        motion, J = _inverse(motion[::-1])
+        slope, covariance = J @ slope[::-1], J @ covariance[::-1] @ np.swapaxes(J, 1, 2)
+    for k, seen in enumerate(instants):
         if k:
-            now.predict(motion[k - 1], reckoning.slope[k - 1], covariance[k - 1])
+            now.predict(motion[k - 1], slope[k - 1], covariance[k - 1])
         r, H = now.innovations(log.measured[seen])
         R, known = variances[seen], r.shape[1]
         S = H @ now.P @ np.swapaxes(H, -1, -2) + R[:, None, :, None] * np.eye(2)
@@ -224,6 +252,15 @@ def _filtered(log: RangeLog, noise: OdometryNoise | None, start: RangeSolution |
             now.add(log.measured[seen[i]], np.diag(R[i]))
             subjects[seen[i]] = (len(now.x) - _FIRST) // 2
     return subjects
+
+
+def _inverse(motion: Matrix) -> tuple[Matrix, Matrix]:
+    """Inverse motions (M, 3), and their Jacobians (M, 3, 3)."""
+    x, y, angle = motion.T
+    c, s = np.cos(angle), np.sin(angle)
+    inverse, zero = np.stack([-c * x - s * y, s * x - c * y, -angle], axis=1), np.zeros_like(x)
+    J = np.array([[-c, -s, inverse[:, 1]], [s, -c, -inverse[:, 0]], [zero, zero, zero - 1.0]])
+    return inverse, np.ascontiguousarray(J.transpose(2, 0, 1))
 
 
 def _chi2(P: Matrix, r: Matrix, H: Matrix, R: Matrix) -> float:
