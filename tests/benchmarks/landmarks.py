@@ -230,7 +230,6 @@ def several_robots(options):
 
 def without_barcodes(options):
     row = table("without barcodes", "ATE m", "landmarks found", "logged", "sightings of none", "contradicted")
-    verdicts = []
 
     def found(name, log):
         part, solution = associated(log, None)
@@ -238,24 +237,27 @@ def without_barcodes(options):
         count, wrong = len(solution.problem.measurements.landmarks), len(contradicted(part, solution))
         logged = len(np.unique(log.subjects))
         row(name, f"{accuracy.poses_m:.3f}", count, logged, len(log.seen_s) - len(part.seen_s), wrong)
-        verdicts.append((accuracy.poses_m > LOST_M, count > logged, wrong > 0))
+        return accuracy.poses_m, count > logged, wrong > 0
 
     log = read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot)
     is_early = log.seen_s < np.median(log.seen_s)
     for name, kept in ("", is_early | True), (", first half", is_early), (", second half", ~is_early):
         found(f"MRCLAM 6{name}", log.seen(kept))
+    every = dict[str, list[tuple[float, bool, bool]]]()
     for name in ("as MRCLAM", "twice the noise", "450 s", "6 landmarks"):
         for seed in range(options.first, options.first + options.seeds):
             with TemporaryDirectory() as folder:
                 write_mrclam(Path(folder), World(seed, **WORLDS[name]))
-                found(f"{name}, seed {seed}", read_mrclam(Path(folder), 1))
-    is_lost, is_larger, is_warned = np.array(verdicts).T
-    for name, group in (
-        ("lost", is_lost),
-        ("duplicates only", is_larger & ~is_lost),
-        ("right", ~(is_lost | is_larger)),
-    ):
-        print(f"{name}: warned of {np.count_nonzero(group & is_warned)} of {np.count_nonzero(group)}")
+                every.setdefault(name, []).append(found(f"{name}, seed {seed}", read_mrclam(Path(folder), 1)))
+    row = table(
+        "simulated", "logs", "ATE m, median", "largest", "lost", "with duplicates", "warned of: lost", "not lost"
+    )
+    for name, each in every.items():
+        ate_m, is_larger, is_warned = np.array(each).T
+        is_lost = ate_m > LOST_M
+        warned = (is_warned * is_lost).sum(), (is_warned * ~is_lost).sum()
+        row(name, len(each), f"{np.median(ate_m):.3f}", f"{ate_m.max():.3f}", is_lost.sum(),
+            int((is_larger * ~is_lost).sum()), *map(int, warned))  # fmt: skip
 
 
 def main():
