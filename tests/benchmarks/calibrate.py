@@ -15,9 +15,9 @@ import numpy as np
 import scanchain
 from scanchain import lie
 from scanchain.calibration import Parameter, calibrate
-from scanchain.calibration.calibrate import angles_of
 from scanchain.logs.messages.lidar import with_offsets
 from scanchain.logs.messages.poses import StampedPose
+from scanchain.logs.mounting import angles_rad
 from scanchain.logs.stream import decoded_messages
 from scanchain.logs.writer import Link, LogWriter, pack_odometry, pack_transforms, place
 from scanchain.runs.job import Progress
@@ -97,7 +97,7 @@ def made(seed: int, world: str, sensor: str, seconds: float, cache: Path) -> tup
     true |= {"scale of distances": 1.0 + 0.01 * scale, "scale of turns": 1.0 + 0.02 * turn}
     poses = {"other": T_lidar_other, "base": T_base_lidar, "IMU": lie.inverse(T_base_lidar) @ T_base_imu}
     for key, T in poses.items():
-        values = [*T[:3, 3], *np.degrees(angles_of(T))]
+        values = [*T[:3, 3], *np.degrees(angles_rad(T))]
         true |= {
             f"{key} {name}": value
             for name, value in zip(("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True)

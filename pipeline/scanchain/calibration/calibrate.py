@@ -21,6 +21,7 @@ from scanchain.errors import InputError, counted
 from scanchain.logs import Log
 from scanchain.logs.messages.lidar import with_offsets
 from scanchain.logs.messages.poses import StampedPose
+from scanchain.logs.mounting import angles_rad
 from scanchain.logs.stream import decoded_messages
 from scanchain.odometry import Odometry, Tracked
 from scanchain.odometry.delay import LONGEST_S, WheelDelay
@@ -83,7 +84,7 @@ class Calibration:
     def add_pose(self, sensor: str, T: Pose, sigmas: Sequence[float] | Vector, lacks: Sequence[str]) -> bool:
         """Add position and angles (6 σ) of a pose; True if all but those with an infinite σ are observable."""
         T, used = lie.lift(T), range(6) if len(T) == 4 else (0, 1, 5)
-        values = [*T[:3, 3].tolist(), *angles_of(T)]
+        values = [*T[:3, 3].tolist(), *angles_rad(T)]
         known = [
             self.add(sensor, ("x", "y", "z", *_ANGLES)[i], "m" if i < 3 else "deg", values[i], sigmas[i], lacks[i])
             for i in used
@@ -303,7 +304,7 @@ def _of_imu(result: Calibration, odometry: Odometry, motions: Motions, scans: Se
         R[:3, :3] = gyro.model.axes / scale
         R = lie.exp(np.concatenate([np.zeros(3), found.x[:3]])) @ R
         lack = "the log turns about one axis, or hardly turns"
-        rows = zip(_ANGLES, angles_of(R), found.sigmas[:3], strict=True)
+        rows = zip(_ANGLES, angles_rad(R), found.sigmas[:3], strict=True)
         known = [result.add("IMU", name, "deg", value, sigma, lack) for name, value, sigma in rows]
         if all(known) and scale > 0.0:
             result.keys["imu_rotation"] = _numbers(lie.to_quaternion(R[:3, :3]))
@@ -339,12 +340,6 @@ def _of_wheels(result: Calibration, log: Log, motions: Motions, begin_ns: int) -
     result.add(name, "scale of distances", "", 1.0 + x[5], s[5], moves, key="odometry_scale")
     result.add(name, "scale of turns", "", 1.0 + x[6], s[6], turns, key="odometry_turn_scale")
     result.add(name, "delay", "s", x[8], s[8], "the speed hardly changes", key="odometry_delay_s")
-
-
-def angles_of(T: Pose) -> list[float]:
-    """Roll, pitch and yaw of a pose (4, 4)."""
-    pitch = math.asin(min(max(-T[2, 0], -1.0), 1.0))
-    return [math.atan2(T[2, 1], T[2, 2]), pitch, math.atan2(T[1, 0], T[0, 0])]
 
 
 def _pose_text(T: Pose) -> str:

@@ -16,13 +16,12 @@ from scanchain.logs import stream
 from scanchain.logs.index import Decoded, FileIndex, name_of
 from scanchain.logs.log import Log
 from scanchain.logs.messages.readers import is_lidar
-from scanchain.logs.opening import AUTO, index_files
+from scanchain.logs.opening import AUTO, DEFAULTS, index_files
 from scanchain.logs.topics import find_lidars, topics_of
 from scanchain.logs.writer import LogWriter
 
-_DEFAULTS = LogConfig()
 _FIXED = "tf_static"  # end of the name of a topic of fixed transforms
-_WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
+_WHOLE = (DEFAULTS.topic, DEFAULTS.start_s, DEFAULTS.end_s, DEFAULTS.every)
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,7 @@ def convert(
     sources: Sequence[Source],
     destination: Path,
     *,
-    config: LogConfig = _DEFAULTS,
+    config: LogConfig = DEFAULTS,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Converted:

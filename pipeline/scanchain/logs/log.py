@@ -35,7 +35,7 @@ from scanchain.logs.mounting import (
     in_plane,
     is_upside_down,
 )
-from scanchain.logs.opening import index_files
+from scanchain.logs.opening import DEFAULTS, index_files
 from scanchain.logs.other_lidars import Together, decoder, other_lidars
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
 from scanchain.logs.samples import HOLD_SCANS, Recorded, ScaledOdometry
@@ -43,11 +43,9 @@ from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sector
 from scanchain.logs.topics import find_ground_truth, find_lidars
 from scanchain.settings import load_settings, overrides_of
 
-_DEFAULTS = LogConfig()
-
 
 def open_log(
-    sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS, **changes: object
+    sources: Source | str | Sequence[Source | str], config: LogConfig = DEFAULTS, **changes: object
 ) -> Log:
     """Log of one file, folder or address, or of several, opened and its topics chosen.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -335,20 +336,22 @@ def tilt_rad(T: Pose) -> float:
     return float(np.arccos(np.clip(abs(T[2, 2]), 0.0, 1.0)))
 
 
+def angles_rad(T: Pose) -> list[float]:
+    """Roll, pitch and yaw of a pose (4, 4)."""
+    return [math.atan2(T[2, 1], T[2, 2]), math.asin(min(max(-T[2, 0], -1.0), 1.0)), math.atan2(T[1, 0], T[0, 0])]
+
+
 def turned_by(T_base_lidar: Pose) -> str:
     """Orientation of a lidar on its base as text, by its nonzero angles; empty if there are none."""
-    T = lie.lift(T_base_lidar)
-    pitch_rad = np.arcsin(np.clip(-T[2, 0], -1.0, 1.0))
-    angles_deg = np.degrees([np.arctan2(T[2, 1], T[2, 2]), pitch_rad, lie.yaw(T)]).tolist()
-    angles = zip(("roll", "pitch", "yaw"), angles_deg, strict=True)
+    angles = zip(("roll", "pitch", "yaw"), np.degrees(angles_rad(lie.lift(T_base_lidar))), strict=True)
     return ", ".join(f"{name} {angle:.0f} deg" for name, angle in angles if abs(angle) > 0.5)
 
 
-def place_text(T: Pose) -> str:
-    """A pose (4, 4) as text: its position and the nonzero angles of its orientation."""
-    at = ", ".join(f"{axis} {value_m:.3f} m" for axis, value_m in zip("xyz", T[:3, 3], strict=True))
+def place_text(T: Pose, frame: str = "") -> str:
+    """A pose as text: its position, on which frame, and the nonzero angles of its orientation."""
+    at = ", ".join(f"{axis} {value_m:.3f} m" for axis, value_m in zip("xyz", T[:-1, -1], strict=False))
     turned = turned_by(T)
-    return f"{at}{turned and ', turned by '}{turned}"
+    return f"{at}{frame and f' on {frame}'}{turned and f', turned by {turned}'}"
 
 
 def in_plane(T_base_lidar: Pose) -> Pose:

@@ -38,10 +38,10 @@ AUTO = "auto"  # value of log.format: the format is recognized from the path
 
 _RUN_FILE = "run.json"
 _POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
-_DEFAULTS = LogConfig()
+DEFAULTS = LogConfig()
 
 
-def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> list[FileIndex]:
+def index_files(sources: Sequence[Source], config: LogConfig = DEFAULTS) -> list[FileIndex]:
     """Index of each file in a log's files, folders and addresses, with every channel and its message count.
 
     Raises InputError for a source that is no log or cannot be read.

@@ -16,7 +16,6 @@ from scanchain.logs.messages.lidar import Returns, moved
 from scanchain.logs.mounting import TILTED_RAD, place_text, tilt_rad
 
 _STEP_NS, _STEP_PERIODS = 1_000_000_000, 5  # largest step of a clock by jitter (0.9 s in Intel), and in periods
-_SAMPLED = 16, 128  # number of messages that are sampled to find the publishers: clouds, planar scans
 _STEADY = 3  # number of scans before and after a jump that must agree with each other
 _TOGETHER_NS = 250_000_000  # longest time between scans of several lidars that are matched together
 
@@ -41,7 +40,7 @@ class Publishers:
         is_planar: bool,
     ) -> None:
         """Find the publishers of sampled messages, ``most`` per block; ``between`` returns T_target_source."""
-        sampled = list(sample(blocks=1, most=_SAMPLED[is_planar]))
+        sampled = list(sample(blocks=1, most=128 if is_planar else 16))
         if not any(len(each.value.points) for each in sampled):
             sampled = list(sample())  # from all over the log
         self.between, self.is_planar = between, is_planar

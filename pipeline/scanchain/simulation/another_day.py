@@ -21,7 +21,6 @@ _APART_M = (0.5, 4.0)  # meters, range of the distance of a move: within sight o
 _TURN_RAD = 0.15  # standard deviation of the turn, in addition to quarter turns
 _ROOM_M = 0.05  # least distance from other solids
 _SAMPLE_M = 2.0 * _ROOM_M  # spacing of the points of a footprint: nothing is farther than ``_ROOM_M`` from one
-_HIGHEST_M = 2.0  # solids that begin higher above the ground, such as lintels, overlap with no object
 _COLUMNS = (
     *("kind", "x_before", "y_before", "z_before", "x_after", "y_after", "z_after"),
     *("length", "width", "height"),
@@ -119,7 +118,7 @@ def _clearance_m(solids: Solids, xy: Matrix) -> float:
     middle = xy.mean(axis=0)
     reach_m = np.linalg.norm(xy - middle, axis=1).max() + np.linalg.norm(solids.rows[:, 3:5], axis=1) + _ROOM_M
     near = np.linalg.norm(solids.rows[:, 1:3] - middle, axis=1) < reach_m
-    return float(solids.part(near).clearance_m(xy, _HIGHEST_M).min())
+    return float(solids.part(near).clearance_m(xy, 2.0).min())  # lintels are higher
 
 
 def _box(thing: Solids) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -17,17 +17,7 @@ from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.geodesy import Geodesy
-from scanchain.logs.writer import (
-    Link,
-    LogWriter,
-    pack_fix,
-    pack_imu,
-    pack_laser_scan,
-    pack_odometry,
-    pack_transforms,
-    place,
-    place_of,
-)
+from scanchain.logs import writer
 from scanchain.simulation.another_day import Change, another_day, write_changes
 from scanchain.simulation.gnss import ORIGIN, RECEIVERS, GnssModel, GnssSamples
 from scanchain.simulation.imu import IMUS, ImuModel
@@ -39,9 +29,6 @@ from scanchain.trajectory import write_tum
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan, in November 2023
 _PLACE, _DEVIATION, _WHEELS, _RANGES, _IMU, _GNSS = range(6)  # each purpose has random numbers of its own
-_ODOMETRY_PERIOD_NS = 20_000_000  # 50 Hz, as of most robots' drivers
-_DROPOUT_S = 1.0  # seconds without scans at each of the dropouts of a world
-_SPARE_M = 0.25  # distance of objects from the drive, beyond the vehicle's half width and deviation
 
 
 class Slip(NamedTuple):
@@ -111,14 +98,20 @@ def plan(
     gnss: str | None = None,
 ) -> Drive:
     """The drive that ``simulate`` records for the same arguments."""
-    if world not in WORLDS:
-        raise InputError(f"world {world!r} does not exist; choose one of {', '.join(WORLDS)}")
-    if imu is not None and imu not in IMUS:
-        raise InputError(f"IMU {imu!r} does not exist; choose one of {', '.join(IMUS)}")
-    if gnss is not None and gnss not in RECEIVERS:
-        raise InputError(f"GNSS receiver {gnss!r} does not exist; choose one of {', '.join(RECEIVERS)}")
+    known = {"world": WORLDS, "IMU": IMUS, "GNSS receiver": RECEIVERS, "sensor": SENSORS}
+    for (what, choices), name in zip(known.items(), (world, imu, gnss, sensor or None), strict=True):
+        if name is not None and name not in choices:
+            raise InputError(f"{what} {name!r} does not exist; choose one of {', '.join(choices)}")
     scene = WORLDS[world]
-    lidar = _sensor(sensor or scene.sensor, noise_m, dropout, scene.sight_m)
+    lidar = SENSORS[sensor or scene.sensor]
+    lidar = replace(
+        lidar,
+        max_range_m=min(lidar.max_range_m, scene.sight_m),
+        noise_m=lidar.noise_m if noise_m is None else noise_m,
+        dropout=lidar.dropout if dropout is None else dropout,
+    )
+    _check_range("noise_m", lidar.noise_m, 0.0, 10.0)
+    _check_range("dropout", lidar.dropout, 0.0, 1.0)
     length_s = scene.duration_s if duration_s is None else duration_s
     _check_range("duration_s", length_s, lidar.period_ns * 1e-9, 36_000.0)  # 10 h: the plan is in memory
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
@@ -145,7 +138,7 @@ def plan(
     changes: tuple[Change, ...] = ()
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, 0.1))[:, :2, 3]
-        free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m + _SPARE_M
+        free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m + 0.25
         solids, changes = another_day(solids, path, free_m, _random(seed, _PLACE, changed))
         T_world_map = moving(rng=_random(seed, _DEVIATION)).lidar(np.zeros(1))[0]
         changes = tuple(change.seen_from(lie.inverse(T_world_map)) for change in changes)
@@ -174,7 +167,7 @@ def _check_range(name: str, value: float, low: float, high: float) -> None:
 def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArray[np.int64]:
     """Numbers of all scans outside the dropouts: 1 s each, around the closest point of the first visit."""
     kept = np.ones(count, dtype=bool)
-    lacking = round(_DROPOUT_S * 1e9 / sensor.period_ns)
+    lacking = round(1e9 / sensor.period_ns)  # of 1 s
     times_s = np.arange(count) * (sensor.period_ns * 1e-9)
     path = motion.base(times_s)[:, :2, 3] if world.dropouts else np.empty((count, 2))
     for middle in world.dropouts:
@@ -185,21 +178,6 @@ def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArr
             first = int(visit[np.argmin(distance_m[visit])])
             kept[max(first - lacking // 2, 0) :][:lacking] = False
     return np.flatnonzero(kept)
-
-
-def _sensor(name: str, noise_m: float | None, dropout: float | None, sight_m: float) -> Sensor:
-    if name not in SENSORS:
-        raise InputError(f"sensor {name!r} does not exist; choose one of {', '.join(SENSORS)}")
-    sensor = SENSORS[name]
-    sensor = replace(
-        sensor,
-        max_range_m=min(sensor.max_range_m, sight_m),
-        noise_m=sensor.noise_m if noise_m is None else noise_m,
-        dropout=sensor.dropout if dropout is None else dropout,
-    )
-    _check_range("noise_m", sensor.noise_m, 0.0, 10.0)
-    _check_range("dropout", sensor.dropout, 0.0, 1.0)
-    return sensor
 
 
 def simulate(
@@ -248,19 +226,19 @@ def record(
             raise InputError(f"{file}: exists; choose another name or pass --force to replace it")
     truth = drive.truth()
     period_ns = drive.sensor.period_ns
-    with LogWriter(destination, force=force) as log:
-        links = [Link("base_link", "lidar", place(drive.T_base_lidar))]
+    with writer.LogWriter(destination, force=force) as log:
+        links = [writer.Link("base_link", "lidar", writer.place(drive.T_base_lidar))]
         if drive.imu is not None and drive.imu.is_transform_known:
-            links.append(Link("base_link", "imu_link", place(drive.imu.T_base_imu)))
+            links.append(writer.Link("base_link", "imu_link", writer.place(drive.imu.T_base_imu)))
         if drive.gnss is not None:
-            antenna = place_of(drive.gnss.antenna_m.tolist(), (0.0, 0.0, 0.0, 1.0))
-            links.append(Link("base_link", "gnss_link", antenna))
-        log.append("/tf_static", "tf2_msgs/msg/TFMessage", pack_transforms(EPOCH_NS, *links), EPOCH_NS)
+            antenna = writer.place_of(drive.gnss.antenna_m.tolist(), (0.0, 0.0, 0.0, 1.0))
+            links.append(writer.Link("base_link", "gnss_link", antenna))
+        log.append("/tf_static", "tf2_msgs/msg/TFMessage", writer.pack_transforms(EPOCH_NS, *links), EPOCH_NS)
         others = _OtherSensors(log, drive, int(truth.stamps_ns[-1]) + period_ns)
         for done, sweep in enumerate(_sweeps(drive)):
             stamp_ns = int(truth.stamps_ns[done])
             others.write_until(stamp_ns - 1)  # in a dropout
-            pose = pack_odometry(stamp_ns, "world", "lidar", place(truth.poses[done]))
+            pose = writer.pack_odometry(stamp_ns, "world", "lidar", writer.place(truth.poses[done]))
             log.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
             others.write_until(stamp_ns + period_ns)
             _write_sweep(log, sweep, drive.sensor, stamp_ns)
@@ -300,7 +278,7 @@ class _Message(NamedTuple):
 class _OtherSensors:
     """Messages of the wheels, the IMU and the GNSS receiver until ``last_ns``, in the order of their stamps."""
 
-    def __init__(self, log: LogWriter, drive: Drive, last_ns: int) -> None:
+    def __init__(self, log: writer.LogWriter, drive: Drive, last_ns: int) -> None:
         self._log = log
         sources = [_wheels(drive, last_ns)]
         if drive.imu is not None:
@@ -318,7 +296,7 @@ class _OtherSensors:
 
 
 def _wheels(drive: Drive, last_ns: int) -> Iterator[_Message]:
-    stamps_ns = np.arange(EPOCH_NS, last_ns + 1, _ODOMETRY_PERIOD_NS)
+    stamps_ns = np.arange(EPOCH_NS, last_ns + 1, 20_000_000)  # 50 Hz, as of most robots' drivers
     times_s = (stamps_ns - EPOCH_NS) * 1e-9 - drive.wheels_delay_s
     begin_s, end_s, size_m = drive.wheels_slip
     slips_m = np.diff(size_m * np.clip((times_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
@@ -326,7 +304,7 @@ def _wheels(drive: Drive, last_ns: int) -> Iterator[_Message]:
     poses = wheel_odometry(poses, drift=drive.drift, rng=rng, slips_m=slips_m)
     covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drive.drift, 1e-3) ** 2
     for stamp_ns, pose in zip(stamps_ns.tolist(), poses, strict=True):
-        data = pack_odometry(stamp_ns, "odom", "base_link", place(pose), covariance)
+        data = writer.pack_odometry(stamp_ns, "odom", "base_link", writer.place(pose), covariance)
         yield _Message(stamp_ns, "/odom", "nav_msgs/msg/Odometry", data)
 
 
@@ -335,7 +313,8 @@ def _imu(drive: Drive, imu: ImuModel, last_ns: int) -> Iterator[_Message]:
     instants_s = (stamps_ns - EPOCH_NS - imu.delay_ns) * 1e-9
     samples = imu.measure(drive.motion, instants_s, _random(drive.seed, _IMU, drive.changed))
     for stamp_ns, *vectors in zip(stamps_ns.tolist(), *(values.tolist() for values in samples), strict=True):
-        yield _Message(stamp_ns, "/imu/data", "sensor_msgs/msg/Imu", pack_imu(stamp_ns, "imu_link", *vectors))
+        data = writer.pack_imu(stamp_ns, "imu_link", *vectors)
+        yield _Message(stamp_ns, "/imu/data", "sensor_msgs/msg/Imu", data)
 
 
 def fixes_of(drive: Drive, gnss: GnssModel, last_ns: int) -> tuple[NDArray[np.int64], GnssSamples]:
@@ -349,11 +328,11 @@ def _gnss(drive: Drive, gnss: GnssModel, last_ns: int) -> Iterator[_Message]:
     stamps_ns, samples = fixes_of(drive, gnss, last_ns)
     positions = Geodesy(*ORIGIN).geodetic(samples.enu_m)
     for stamp_ns, position, is_out in zip(stamps_ns.tolist(), positions.tolist(), samples.is_out, strict=True):
-        data = pack_fix(stamp_ns, "gnss_link", position, None if is_out else gnss.sigma_m)
+        data = writer.pack_fix(stamp_ns, "gnss_link", position, None if is_out else gnss.sigma_m)
         yield _Message(stamp_ns, "/fix", "sensor_msgs/msg/NavSatFix", data)
 
 
-def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) -> None:
+def _write_sweep(log: writer.LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) -> None:
     end_ns = stamp_ns + sensor.period_ns
     if sensor.dimension == 3:
         points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
@@ -362,7 +341,7 @@ def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) ->
         return
     first, second = sweep.rays.directions[:2]
     angle_min = float(np.arctan2(first[1], first[0]))
-    data = pack_laser_scan(
+    data = writer.pack_laser_scan(
         stamp_ns,
         "lidar",
         angle_min,

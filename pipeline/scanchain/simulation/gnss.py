@@ -13,8 +13,6 @@ from scanchain.data import Mask, Matrix, Pose, Vector
 from scanchain.simulation.motion import Motion
 
 ORIGIN = (49.0, 8.4, 115.0)  # latitude and longitude in degrees, altitude in m, of the origin of the world
-_MEAN_STRETCH_S = 10.0  # of an interval with multipath, and of one without
-_CLEAR_S = 3.0  # the first seconds are without multipath, as where a drive begins
 
 
 T_ENU_WORLD: Pose = lie.exp(np.deg2rad(35.0) * np.eye(6)[5])  # its x axis points to 35° north of east
@@ -57,9 +55,10 @@ class GnssModel:
 
     def _multipath(self, instants_s: NDArray[np.floating], rng: np.random.Generator) -> Matrix:
         """Errors (N, 3) by multipath: constant in intervals of random length, zero in every other one."""
-        result, begin_s, is_wrong = np.zeros((len(instants_s), 3)), float(instants_s[0]) + _CLEAR_S, True
+        result, is_wrong = np.zeros((len(instants_s), 3)), True
+        begin_s = float(instants_s[0]) + 3.0  # a drive begins in the clear
         while self.multipath_m[1] and begin_s < instants_s[-1]:
-            end_s = begin_s + _MEAN_STRETCH_S * rng.uniform(0.5, 1.5)
+            end_s = begin_s + 10.0 * rng.uniform(0.5, 1.5)  # as long with multipath as without
             size_m, azimuth = rng.uniform(*self.multipath_m), rng.uniform(0.0, 2.0 * np.pi)
             error = size_m * np.array([np.cos(azimuth), np.sin(azimuth), 0.5 * rng.standard_normal()])
             result[(instants_s >= begin_s) & (instants_s < end_s)] = error * is_wrong

@@ -21,20 +21,11 @@ import numpy as np
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, printable
+from scanchain.logs import writer
 from scanchain.logs.formats import Format, UnknownFormatError
 from scanchain.logs.formats.mcap import temporary_index
 from scanchain.logs.index import FileIndex, most_decompressed_file
-from scanchain.logs.writer import (
-    LATEST_NS,
-    Link,
-    LogWriter,
-    pack_laser_scan,
-    pack_odometry,
-    pack_transforms,
-    place_of,
-)
 
-_LEAST_STEP_NS = 100_000  # smallest step between the log times of two scans, which preserves their order
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
@@ -70,7 +61,7 @@ def index_carmen(path: Path, number: int, _: LogConfig) -> FileIndex:
     return index
 
 
-def _write(log: LogWriter, lines: Iterator[bytes], malformed: list[int], others: Counter[bytes]) -> None:
+def _write(log: writer.LogWriter, lines: Iterator[bytes], malformed: list[int], others: Counter[bytes]) -> None:
     """Write the messages of each line of a known kind.
 
     malformed : set to the number of the first malformed line and the count of malformed lines
@@ -91,23 +82,23 @@ def _write(log: LogWriter, lines: Iterator[bytes], malformed: list[int], others:
             continue
         try:  # the stamp is the third word from the end, a double as in CARMEN
             stamp_ns = int(float(words[-3]) * 1e9)
-            if not 0 <= stamp_ns < LATEST_NS:
+            if not 0 <= stamp_ns < writer.LATEST_NS:
                 raise ValueError
             if kind not in SCANS:
                 topic, frame = ("/odom", "odom") if kind == b"ODOM" else ("/ground_truth", "world")
-                packed = pack_odometry(stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
+                packed = writer.pack_odometry(stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
                 log.append(topic, "nav_msgs/msg/Odometry", packed, stamp_ns, max(stamp_ns, scan_ns))
                 continue
             scan, robot, laser = read_scan(words, stamp_ns, parameters)
         except (ValueError, IndexError, OverflowError):
             malformed[:] = malformed[0] or number, malformed[1] + 1
             continue
-        scan_ns = max(stamp_ns, scan_ns + _LEAST_STEP_NS)
+        scan_ns = max(stamp_ns, scan_ns + 100_000)  # preserves the order
         if not is_mounted:
-            mounting = pack_transforms(stamp_ns, Link("base_link", "laser", laser))
+            mounting = writer.pack_transforms(stamp_ns, writer.Link("base_link", "laser", laser))
             log.append("/tf_static", "tf2_msgs/msg/TFMessage", mounting, stamp_ns, scan_ns)
             is_mounted = True
-        packed = pack_odometry(stamp_ns, "odom", "base_link", robot)
+        packed = writer.pack_odometry(stamp_ns, "odom", "base_link", robot)
         log.append("/odom", "nav_msgs/msg/Odometry", packed, stamp_ns, scan_ns)
         log.append("/scan", "sensor_msgs/msg/LaserScan", scan, stamp_ns, scan_ns)
 
@@ -138,13 +129,13 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
         mounting = planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
     reach_m = min(max_range_m, _LEAST_CODE_M) if max_range_m > 0.0 else _LEAST_CODE_M
     beams = first_rad, step_rad, np.array(ranges_m)
-    scan = pack_laser_scan(stamp_ns, "laser", *beams, range_min_m=0.0, range_max_m=reach_m)
+    scan = writer.pack_laser_scan(stamp_ns, "laser", *beams, range_min_m=0.0, range_max_m=reach_m)
     return scan, planar(*poses[3:]), mounting
 
 
 def planar(x_m: float, y_m: float, yaw_rad: float) -> Any:
     """Pose in the plane, as a message."""
-    return place_of((x_m, y_m, 0.0), (0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)))
+    return writer.place_of((x_m, y_m, 0.0), (0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)))
 
 
 def _numbers(words: list[bytes], count: int) -> list[float]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scanchain.config import LogConfig
-from scanchain.data import Pose
 from scanchain.errors import InputError
 from scanchain.logs.files import evalio_name, evalio_sequence
 from scanchain.logs.formats import Format
@@ -17,7 +15,7 @@ from scanchain.logs.formats.mcap import temporary_index
 from scanchain.logs.index import FileIndex
 from scanchain.logs.writer import Link, LogWriter, pack_imu, pack_odometry, pack_transforms, place
 
-_LIDAR, _IMU, _WORLD = "lidar", "imu", "world"  # frames
+_LIDAR, _IMU = "lidar", "imu"  # frames
 
 
 def index_sequence(path: Path, number: int, _: LogConfig) -> FileIndex:
@@ -31,14 +29,14 @@ def index_sequence(path: Path, number: int, _: LogConfig) -> FileIndex:
 
 def _write(log: LogWriter, sequence: Any) -> None:
     T_imu_lidar = sequence.imu_T_lidar().to_mat()
-    truth = _truth(sequence)
+    truth = iter(list[Any](sequence.ground_truth() or ()))
     upcoming = next(truth, None)
     for count, measurement in enumerate(sequence):
         stamp_ns = measurement.stamp.to_nsec()
         if not count:
             links = pack_transforms(stamp_ns, Link(_IMU, _LIDAR, place(T_imu_lidar)))
             log.append("/tf_static", "tf2_msgs/msg/TFMessage", links, stamp_ns)
-        while upcoming is not None and upcoming[0] <= stamp_ns:
+        while upcoming is not None and upcoming[0].to_nsec() <= stamp_ns:
             _write_truth(log, *upcoming)
             upcoming = next(truth, None)
         if hasattr(measurement, "gyro"):
@@ -52,14 +50,10 @@ def _write(log: LogWriter, sequence: Any) -> None:
         _write_truth(log, *each)
 
 
-def _write_truth(log: LogWriter, stamp_ns: int, T_world_imu: Pose) -> None:
-    data = pack_odometry(stamp_ns, _WORLD, _IMU, place(T_world_imu))
+def _write_truth(log: LogWriter, stamp: Any, T_world_imu: Any) -> None:
+    stamp_ns = stamp.to_nsec()
+    data = pack_odometry(stamp_ns, "world", _IMU, place(T_world_imu.to_mat()))
     log.append("/ground_truth", "nav_msgs/msg/Odometry", data, stamp_ns)
-
-
-def _truth(sequence: Any) -> Iterator[tuple[int, Pose]]:
-    for stamp, T_world_imu in sequence.ground_truth() or ():
-        yield stamp.to_nsec(), T_world_imu.to_mat()
 
 
 FORMAT = Format(

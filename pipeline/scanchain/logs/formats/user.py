@@ -17,8 +17,6 @@ from scanchain.logs.formats.mcap import temporary_index
 from scanchain.logs.index import FileIndex
 from scanchain.logs.writer import LATEST_NS, LogWriter
 
-_TOPIC, _FRAME = "/points", "lidar"
-
 
 class ScanFormat(Protocol):
     """Protocol of the class named by ``log.format``: constructed from a log's path, it iterates over its scans."""
@@ -72,4 +70,4 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
         rows = np.asarray(points, np.float32)
         rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # z = 0, from which the log is recognized as 2D
         fields = {"time": np.asarray(times_s, np.float32)} if len(scan.times_s) else {}
-        log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, fields)
+        log.point_cloud("/points", scan.stamp_ns, "lidar", rows, fields)

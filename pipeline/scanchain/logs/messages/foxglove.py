@@ -43,14 +43,17 @@ class _Pose(Struct, frozen=True):
     orientation: _Vector = _Vector()
 
 
-class _LaserScan(Struct, frozen=True):
+class _Header(Struct, frozen=True, kw_only=True):
+    timestamp: _Stamp = _Stamp()
+    frame_id: str = ""
+
+
+class _LaserScan(_Header, frozen=True):
     """A foxglove.LaserScan; a range of null is NaN."""
 
     ranges: list[float | None]
     start_angle: float
     end_angle: float
-    timestamp: _Stamp = _Stamp()
-    frame_id: str = ""
     pose: _Pose = _Pose()
 
 
@@ -60,21 +63,17 @@ class _PackedField(Struct, frozen=True):
     type: int
 
 
-class _PointCloud(Struct, frozen=True):
+class _PointCloud(_Header, frozen=True):
     """A foxglove.PointCloud; ``data`` is base64."""
 
     point_stride: int
     fields: list[_PackedField]
     data: bytes
-    timestamp: _Stamp = _Stamp()
-    frame_id: str = ""
     pose: _Pose = _Pose()
 
 
-class _PoseInFrame(Struct, frozen=True):
+class _PoseInFrame(_Header, frozen=True):
     pose: _Pose
-    timestamp: _Stamp = _Stamp()
-    frame_id: str = ""
 
 
 class _FrameTransform(Struct, frozen=True):
@@ -89,14 +88,12 @@ class _FrameTransforms(Struct, frozen=True):
     transforms: list[_FrameTransform]
 
 
-class _LocationFix(Struct, frozen=True):
+class _LocationFix(_Header, frozen=True):
     latitude: float
     longitude: float
     altitude: float = 0.0
     position_covariance: list[float] = []
     position_covariance_type: int = 0
-    timestamp: _Stamp = _Stamp()
-    frame_id: str = ""
 
 
 def laser_scan(message: _LaserScan) -> Sensed:

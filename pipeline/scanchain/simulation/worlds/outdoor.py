@@ -75,7 +75,6 @@ TOWN_ROUTE = np.array([
 ])  # fmt: skip
 
 ROUNDS_CAR = replace(TOWN_CAR, corner_m=4.0)  # tighter bends, so that it keeps its lane
-_LANE_FREE_M = 1.8  # on either side of the middle of a lane
 
 # In the right lane, 2 m from the middle of the street, but finally in the left one.
 ROUNDS_ROUTE = np.array([
@@ -191,7 +190,7 @@ def rounds(rng: np.random.Generator) -> Solids:
     is_kept = solids.rows[:, 0] != BOX
     boxes = solids.rows[~is_kept]
     gap = np.abs(lanes[:, None] - boxes[:, 1:3]) - boxes[:, 3:5]
-    is_kept[~is_kept] = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0) > _LANE_FREE_M
+    is_kept[~is_kept] = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0) > 1.8  # half a lane
     return solids.part(is_kept)
 
 
