@@ -15,9 +15,6 @@ from scanchain.maps import open_saved_map
 from scanchain_viz.colors import height_shares, palette_of, rgb
 from scanchain_viz.pictures.maps import VIRIDIS, map_points, surroundings
 
-_SIDES = 720, 540  # largest width and height, pixels
-_FRAMES = 72
-_FRAME_MS, _LAST_MS = 70, 2500
 _MOST_BYTES = 3_000_000  # a larger file is drawn again with half the frames
 _HEIGHTS = 48  # colors of 3D points, from low to high; points of a plane have one
 _BACKGROUND, _POINTS, _PATH, _HEAD = "#12161b", "#e7eaee", "#ff8a3d", "#ffffff"
@@ -34,7 +31,7 @@ def draw_growing_map(directory: Path, picture: Path) -> None:
     clouds = map_points(saved)
     positions = lie.lift(saved.poses)[:, :3, 3]
     low, high = surroundings(positions, [np.vstack(clouds)])
-    scale = min(side / max(size, 1e-6) for side, size in zip(_SIDES, (high - low)[:2], strict=True))
+    scale = min(side / max(size, 1e-6) for side, size in zip((720, 540), (high - low)[:2], strict=True))
     width, height = np.maximum(np.ceil(scale * (high - low)[:2]), 1.0).astype(int).tolist()
 
     def pixels(points: np.ndarray) -> np.ndarray:
@@ -66,7 +63,7 @@ def draw_growing_map(directory: Path, picture: Path) -> None:
             found.append(image)
         return found
 
-    count = min(_FRAMES, len(clouds))
+    count = min(72, len(clouds))
     data = _gif(frames(count))
     while len(data) > _MOST_BYTES and count > 1:
         count //= 2
@@ -80,6 +77,6 @@ def draw_growing_map(directory: Path, picture: Path) -> None:
 def _gif(frames: list[Image.Image]) -> bytes:
     """The frames one after the other, endlessly, the last one for longer."""
     file, first = BytesIO(), frames[0]
-    times = [_FRAME_MS] * (len(frames) - 1) + [_LAST_MS]
-    first.save(file, "GIF", save_all=True, append_images=frames[1:], duration=times, loop=0, disposal=1)
+    times_ms = [70] * (len(frames) - 1) + [2500]
+    first.save(file, "GIF", save_all=True, append_images=frames[1:], duration=times_ms, loop=0, disposal=1)
     return file.getvalue()

@@ -14,7 +14,6 @@ MARGIN = 0.05  # margin on either side, as a fraction of the range of the values
 _MOST = 10  # largest number of ticks
 _ROUND = "125"  # steps between ticks, times a power of ten
 _DECADES = ("125", 1), ("13", 1), ("1", 1), ("1", 2), ("1", 3), ("1", 10), ("1", 50)  # ticks, in every n-th decade
-_FEW = 100.0  # ratio of the ends up to which a logarithmic axis with fewer than three decades has round steps
 _TINY = 1e-9  # share of a step by which the end of a range may miss a tick
 
 
@@ -84,7 +83,7 @@ class Axis:
             for factors, every in _DECADES:
                 decades = [float(f"{factor}e{exponent}") for exponent in exponents[::every] for factor in factors]
                 values = [value for value in decades if low <= value <= high]
-                if len(values) > 2 or high > _FEW * low:
+                if len(values) > 2 or high > 100.0 * low:
                     yield values, [f"{value:g}" for value in values]
         least = (high - low) / _MOST
         for exponent in count(int(np.floor(np.log10(least)))):

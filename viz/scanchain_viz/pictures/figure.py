@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
@@ -36,27 +36,6 @@ _INCH = 72.0  # points, the unit of the drawing
 _TICK = 3.5  # length of a tick, and its distance from the number, in points
 _ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # height of text above and below its baseline
 _FRAME = "#cccccc"  # of axes on white
-_PANEL_INCHES = (2.0, 12.0)  # least and greatest height of a figure in a PNG
-
-
-class Layout(NamedTuple):
-    """Width of a figure, and greatest height of a plan, in inches; the size of the text is the same in all."""
-
-    width: float
-    highest: float
-
-
-class Margins(NamedTuple):
-    """Inches around the axes: room for numbers and labels."""
-
-    left: float
-    right: float
-    bottom: float
-    top: float
-
-
-_NEXT_TO_ANOTHER, _ACROSS_THE_PAGE = Layout(4.6, 5.2), Layout(9.6, 6.5)
-_MARGINS = Margins(left=0.8, right=0.2, bottom=0.45, top=0.12)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,12 +86,12 @@ class Plot:
 
     def _lay_out(self, *, is_wide: bool) -> None:
         """Set the size of the figure, corner and extent of its axes; in a plan, their scales are equal."""
-        width, highest = _ACROSS_THE_PAGE if is_wide else _NEXT_TO_ANOTHER
+        width, highest = (9.6, 6.5) if is_wide else (4.6, 5.2)  # inches, as all here: of a figure; of a plan
+        left, right, bottom, top = 0.8, 0.2, 0.45, 0.12  # around the axes, for numbers and labels
         height, shape = self.height_inches, np.array(self.proportions)
-        left, right, bottom, top = _MARGINS
         room = width - left - right
         if shape[0]:
-            height = float(np.clip(room * shape[1] / shape[0] + bottom + top, 1.5, highest))  # in inches
+            height = float(np.clip(room * shape[1] / shape[0] + bottom + top, 1.5, highest))
         room = _INCH * np.array([room, height - bottom - top])
         self.size = _INCH * width, _INCH * height
         self.extent = np.min(room / shape) * shape if shape[0] else room
@@ -303,7 +282,7 @@ def write_png(path: Path, panels: Sequence[tuple[str, Plot]], *, width_inches: f
     from matplotlib.figure import Figure
 
     shapes = [plot.proportions for _, plot in panels]
-    height_inches = np.clip(width_inches * max(height / width for width, height in shapes), *_PANEL_INCHES)
+    height_inches = np.clip(width_inches * max(height / width for width, height in shapes), 2.0, 12.0)
     size = len(panels) * width_inches, float(height_inches) + 0.77  # room for title and labels
     figure, named = Figure(figsize=size, layout="constrained"), {}
     for axes, (title, plot) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):

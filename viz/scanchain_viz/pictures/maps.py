@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -32,30 +32,9 @@ VIRIDIS = (
     "3fbc73", "5ec962", "84d44b", "addc30", "d8e219", "fde725",
 )  # fmt: skip
 _REACH = 0.5  # share of the range of ``MIDDLE`` beyond which a point of a map is an outlier
-_ALL_BUT_FEW = (0.05, 99.95)  # percentiles of the other points that are shown
 _NO_POINTS = np.empty((0, 3))
 _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of 3D points, by height
-
-
-class PointStyle(NamedTuple):
-    """Rendering of the points of a map as an image, which is part of the page.
-
-    most : largest number of points; further ones are left out
-    pixels_per_root, widths : width of the image per square root of its points, and its limits, pixels
-    shades, heights : numbers of opacities, and of colors of heights: a PNG has a palette of 256
-    opaque, opacities : number of points up to which each is opaque; range of their opacity
-    """
-
-    most: int = 120_000
-    pixels_per_root: float = 2.0
-    widths: tuple[float, float] = (200.0, 700.0)
-    shades: int = 6
-    heights: int = 36
-    opaque: int = 40_000
-    opacities: tuple[float, float] = (0.4, 1.0)
-
-
-_STYLE = PointStyle()
+_MOST_POINTS = 120_000  # drawn of a map; further ones are left out
 
 
 def surroundings(positions: NDArray[np.floating], clouds: Sequence[Points]) -> tuple[Floats, Floats]:
@@ -72,13 +51,13 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
     size = high - low
     size[:2] = size[:2].max()
     inside = points[((points >= low - _REACH * size) & (points <= high + _REACH * size)).all(axis=1)]
-    low, high = np.percentile(inside, _ALL_BUT_FEW, axis=0)
+    low, high = np.percentile(inside, (0.05, 99.95), axis=0)  # all but few
     return low, high
 
 
 def map_points(prior: SavedMap) -> list[Points]:
     """Points (M, 3) sampled from each keyframe of a map, in its frame."""
-    each = max(_STYLE.most // max(len(prior.keyframes), 1), 1)
+    each = max(_MOST_POINTS // max(len(prior.keyframes), 1), 1)
     clouds = []
     for keyframe in prior.keyframes:
         points = keyframe.points
@@ -124,25 +103,29 @@ def draw_points(
 
     grain_m : distance of neighboring points and least edge of a pixel; 0 if unknown
     """
-    points = points[:: max(1, -(-len(points) // _STYLE.most))]
+    points = points[:: max(1, -(-len(points) // _MOST_POINTS))]
     points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)]
     if not len(points):
         return
     colors = colors if len(colors) == 1 or np.ptp(points[:, 2]) else (GRAY,)
     size_m = float(high[0] - low[0])
-    width = float(np.clip(_STYLE.pixels_per_root * np.sqrt(len(points)), *_STYLE.widths))
-    edge_m = max(grain_m, size_m / _STYLE.widths[1]) if grain_m else size_m / width
+    widest = 700.0  # pixels
+    width = float(np.clip(2.0 * np.sqrt(len(points)), 200.0, widest))
+    edge_m = max(grain_m, size_m / widest) if grain_m else size_m / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
     pixel = row * columns + column
-    opacity = float(np.clip(_STYLE.opaque / len(points), *_STYLE.opacities))
-    counts = np.minimum(np.bincount(pixel, minlength=rows * columns), _STYLE.shades)
-    shades, highest = palette_of(colors, _STYLE.heights if len(colors) > 1 else 1), np.zeros(rows * columns, int)
+    opacity, most = (
+        float(np.clip(40_000 / len(points), 0.4, 1.0)),
+        6,
+    )  # of a point; points above which more count alike
+    counts = np.minimum(np.bincount(pixel, minlength=rows * columns), most)
+    shades, highest = palette_of(colors, 36 if len(colors) > 1 else 1), np.zeros(rows * columns, int)  # 256 in all
     if len(shades) > 1:
         np.maximum.at(highest, pixel, np.rint((len(shades) - 1) * height_shares(points[:, 2])).astype(int))
-    palette = np.repeat(shades, _STYLE.shades + 1, axis=0)
-    palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(_STYLE.shades + 1))), len(shades))
-    pixels = (highest * (_STYLE.shades + 1) + counts).reshape(rows, columns).astype(np.uint8)
+    palette = np.repeat(shades, most + 1, axis=0)
+    palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(most + 1))), len(shades))
+    pixels = (highest * (most + 1) + counts).reshape(rows, columns).astype(np.uint8)
     figure.image(pixels, palette, low, low[:2] + edge_m * np.array(pixels.shape[::-1]))
 
 

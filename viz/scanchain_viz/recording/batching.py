@@ -18,7 +18,6 @@ from scanchain.steps import STAGES, Steps
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
 
-_MAX_SCANS, _MAX_BYTES = 256, 4_000_000  # a batch of scans that is written at once: number and size at most
 WARNING, _INFORMATION = "WARN", "INFO"  # rerun's log levels
 
 
@@ -127,7 +126,7 @@ class Batcher:
         self._frame(positions)
         self.now = Times(steps.columns["index"][-1:], steps.columns["stamp_ns"][-1:])
         self.last = odom[-1:]
-        self.state = steps.last_state
+        self.state = State(steps.texts("state")[-1])
 
     def add(self, step: Step) -> list[Message]:
         """Add a step with the verdicts at that time; returns the messages that are due."""
@@ -142,7 +141,7 @@ class Batcher:
         if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
             points = drawing.at_most(step.local_map, self.config.max_map_points)
             messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
-        is_large = len(self.gathered) >= _MAX_SCANS or self.bytes >= _MAX_BYTES
+        is_large = len(self.gathered) >= 256 or self.bytes >= 4_000_000
         is_due = is_large or perf_counter() - self.started_s >= 0.25  # so that a viewer follows
         return [*messages, *self.messages()] if is_due else messages
 

@@ -19,8 +19,6 @@ Floats = NDArray[np.float32]
 Color = tuple[int, int, int]
 Colors = Color | Sequence[Color] | NDArray[np.uint8]
 
-_WEAKEST = 25.0  # m⁻²: a standard deviation above 0.2 m, or an infinite one, is drawn as 0.2 m
-
 
 @dataclass(frozen=True, slots=True)
 class Times:
@@ -113,7 +111,7 @@ def ellipsoids(informations: Matrix, scale: float) -> rr.ComponentColumnList:
     values, vectors = np.linalg.eigh(np.nan_to_num(informations, posinf=0.0, neginf=0.0))
     scaled = vectors[:, :d, :] / np.sqrt(np.maximum(values, 1e-9))[:, None, :]
     variances, axes = np.linalg.eigh(scaled @ np.swapaxes(scaled, -1, -2))
-    half_sizes = in_space(scale * np.sqrt(np.minimum(variances, 1.0 / _WEAKEST)))
+    half_sizes = in_space(scale * np.sqrt(np.minimum(variances, 0.04)))  # 0.2 m at most, also where infinite
     if d == 2:
         half_sizes[:, 2] = 0.1 * half_sizes.min(axis=1, initial=np.inf, where=[True, True, False])
     rotation = np.tile(np.eye(3), (len(axes), 1, 1))

@@ -61,7 +61,6 @@ SERIES = {  # plots of one series each, and their names
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 _HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
 
-_ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, except in the first scans, which load the kernels
 
 # a list, since the viewer wraps its lines but cuts off those of a table
 _LEGEND = f"""
@@ -152,7 +151,7 @@ def blueprint(
         rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole, plot_legend=hidden)
         for entity, name in SERIES.items()
     )
-    ordinary_ms = rrb.ScalarAxis(range=(0.0, _ORDINARY_MS[dimension]))
+    ordinary_ms = rrb.ScalarAxis(range=(0.0, 5.0 if dimension == 2 else 20.0))  # the first scans load kernels
     tabs = rrb.Tabs(
         rrb.TextDocumentView(origin=LEGEND, name="legend"),
         rrb.TextLogView(origin=EVENTS, name="events"),

@@ -23,7 +23,6 @@ from scanchain_viz.report import page
 
 _MAX_TRAJECTORIES = 60  # largest number of runs whose trajectories are drawn
 _BOX = np.array([1.0, 0.84])  # proportions of the plan of a trajectory
-_MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a count is marked
 _HEADS = (
     page.Head("log"),
     page.Head("verdict", "", "reliability of the trajectory; segments to check are in the run's report"),
@@ -89,8 +88,8 @@ def _cells(row: Row) -> Sequence[page.Cell | str]:
         page.verdict_cell(m.verdict),
         f"{m.scans:,}",
         page.bad_if(m.contradicted > MOST_CONTRADICTED * m.scans, f"{m.contradicted:,}"),
-        page.bad_if(m.degenerate > _MANY_DEGENERATE * m.scans, f"{m.degenerate:,}"),
-        page.bad_if(m.lost > _MANY_LOST * m.scans, f"{m.lost:,}"),
+        page.bad_if(m.degenerate > 0.5 * m.scans, f"{m.degenerate:,}"),
+        page.bad_if(m.lost > 0.01 * m.scans, f"{m.lost:,}"),
         page.bad_if(row.warnings > 0, f"{row.warnings:,}"),
         f"{m.traveled_m:,.1f}",
         f"{m.closures_accepted:,}",

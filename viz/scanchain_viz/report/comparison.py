@@ -20,7 +20,6 @@ from scanchain_viz.report import page, sections
 _VERDICT = page.Head(
     "verdict", "", "with its error estimate; other tools are judged by wheels and constant velocity alone", True
 )
-_NEARLY = 1.25  # the axes frame the maps that are at most this many times as thick as the sharpest
 
 
 def write_compare_report(directory: Path) -> None:
@@ -84,7 +83,7 @@ def _sections(
     if trajectories:
         # the axes frame the trajectories with maps nearly as sharp as the best; all if there are no maps
         thickness_m = {row.name: row.figures["thickness_m"] or np.inf for row in table.rows}
-        limit_m = _NEARLY * min(thickness_m[each.name] for each in trajectories)
+        limit_m = 1.25 * min(thickness_m[each.name] for each in trajectories)
         framing = [each for each in trajectories if thickness_m[each.name] <= limit_m]
         text = "All start at the same pose."
         if truth is not None:

@@ -42,7 +42,6 @@ STATE_COLORS = {
     MapState.LOST: "#d6453d",
 }
 _AFTERWARDS = "#0f9bb5"
-_AROUND_SIZE, _AROUND_M = 1.5, 1.0  # half the size of a close-up: times that of its cluster, plus meters
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
 _HEX = {label: f"#{bytes(COLORS[label]).hex()}" for label in Label}
 _HOW_LABELED = (
@@ -193,7 +192,7 @@ def _changed(changes: Changes) -> Iterator[page.Section]:
         drawings = []
         for each in changes.clusters[:12]:  # the largest
             center = np.append(each.center[:2], 0.0)
-            half_m = _AROUND_SIZE * float(each.size_m[:2].max()) + _AROUND_M
+            half_m = 1.5 * float(each.size_m[:2].max()) + 1.0
             figure = _changes_picture(points, changes, center - half_m, center + half_m)
             drawings.append(page.Drawing.of(f"{each.number}: {each.kind}", counted(each.points, "point"), figure))
         yield page.Section("The largest changes", drawings=drawings, is_small=True)

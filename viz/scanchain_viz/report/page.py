@@ -27,7 +27,6 @@ _TEMPLATES = Path(__file__).parent / "templates"
 SCRIPT = (_TEMPLATES / "map_viewer.js").read_text(encoding="utf-8")
 _SORTING = (_TEMPLATES / "sorting.js").read_text(encoding="utf-8")
 MAX_ROWS = 100  # largest number of rows of a table; the longest segments or largest clusters are kept
-_MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000  # largest number of points of a line: 0.03 MB of a page
 _HIGHEST = float(np.iinfo(np.uint16).max)  # coordinates have 16 bits
 
@@ -198,7 +197,7 @@ def interactive_map(
     grain_m : distance of neighboring points of the map, the size at which they are drawn in close-ups
     """
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
-    shown = inside[:: max(1, -(-len(inside) // _MAX_POINTS))]
+    shown = inside[:: max(1, -(-len(inside) // 160_000))]  # 6 bytes each, 8 as text: 1.3 MB of a page
     view = _first_view(shown, lines, low, high)
     width, height = (view[1] - view[0])[:2]
     scene = {
