@@ -27,7 +27,7 @@ def _command(parent: str, name: str, group: click.Group = scanchain) -> Iterator
     """Markdown of a command and of those below it."""
     command = group.commands[name]
     path = f"{parent} {name}"
-    ctx = click.Context(command, info_name=path)
+    ctx = click.Context(command, info_name=path, show_default=True)
     yield f"## {path}\n"
     yield f"```{{program}} {path}\n```\n"
     yield f"```text\n{ctx.get_usage().removeprefix('Usage: ')}\n```\n"

@@ -23,8 +23,10 @@ from scanchain.commands.preparing import config, sequence, warm_up
 from scanchain.commands.run import check, run, view
 from scanchain.errors import InputError, OwnCodeError, ScanchainError, printable, remedy_of, spelled
 
+_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 110, "show_default": True}
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+
+@click.group(context_settings=_SETTINGS)
 @click.version_option(package_name="scanchain", message="%(prog)s %(version)s")
 @click.option(
     "--debug", is_flag=True, expose_value=False, help="Print tracebacks of errors; after a command, too."

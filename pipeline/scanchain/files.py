@@ -1,4 +1,4 @@
-"""Files: the path or address of a log, and atomic writing."""
+"""Files: the path or address of a log, JSON, and atomic writing."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
+
+import msgspec
 
 BLOCK_BYTES = 1 << 20  # read or written at once where the whole may not fit the memory
 ATTEMPTS = 4  # number of requests before an error of the network that may be transient is final
@@ -58,6 +60,16 @@ def source_of(named: Source | str) -> Source:
 
         return Path(url2pathname(urlsplit(named).path))
     return Address(named)
+
+
+def json_text(tree: object) -> str:
+    """Records, dictionaries and NumPy numbers as indented JSON; non-finite numbers become null."""
+    return msgspec.json.format(msgspec.json.encode(tree, enc_hook=lambda number: number.item()), indent=2).decode()
+
+
+def write_json(path: Path, tree: object) -> None:
+    """Write ``json_text`` atomically."""
+    write_whole(path, f"{json_text(tree)}\n".encode())
 
 
 def write_whole(path: Path, data: bytes) -> None:

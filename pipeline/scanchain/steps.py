@@ -60,11 +60,6 @@ class Steps:
         found = {sensor: self.columns[f"innovation_{sensor}"] for sensor in SENSORS}
         return {sensor: values for sensor, values in found.items() if np.isfinite(values).any()}
 
-    @property
-    def last_state(self) -> State:
-        """State of the last step."""
-        return State(self.columns.texts[self.columns["state"][-1]])
-
     def trajectory(self, name: str) -> Trajectory:
         """Trajectory of the steps so far, ``T_odom_lidar`` or ``T_world_lidar``, as estimated at each step."""
         return Trajectory(self.columns["stamp_ns"].copy(), self.columns[name].copy())
@@ -86,8 +81,7 @@ class Steps:
 
     def states(self) -> Counter[State]:
         """Number of steps in each state."""
-        names = self.columns.texts
-        return Counter(State(names[code]) for code in self.columns["state"].tolist())
+        return Counter(map(State, self.texts("state")))
 
     @property
     def inlier_shares(self) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ import click
 from scanchain.commands import options
 from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.errors import folded
-from scanchain.files import Source
+from scanchain.files import Source, json_text
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def calibrate(
     with Terminal("scans") as terminal:
         config = load_settings(log.dimension, file=config_file, overrides=overrides).config
         found = calibrate_log(log, config, terminal)
-    click.echo(options.json_text(found) if as_json else folded(_text(found)))
+    click.echo(json_text(found) if as_json else folded(_text(found)))
     if out is not None:
         out.write_text(found.toml(), encoding="utf-8")
         click.echo(f"written {out}", err=as_json)

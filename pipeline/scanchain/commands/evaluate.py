@@ -12,6 +12,7 @@ import click
 from scanchain.commands import options
 from scanchain.commands.options import PATH
 from scanchain.errors import InputError, folded
+from scanchain.files import json_text
 
 if TYPE_CHECKING:
     from scanchain.evaluation.metrics import Results
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     "--align",
     type=click.Choice(["rigid", "first", "none"]),
     default="rigid",
-    show_default=True,
     help="Alignment of the estimate to the ground truth for the ATE.",
 )
 @click.option("--scale", is_flag=True, help="Scale the estimate to fit, too: with --align rigid, Sim(3).")
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 @click.option(
     "--rpe",
     default="1pose,1s,10m,100m",
-    show_default=True,
     metavar="LIST",
     help="Intervals of the RPE in poses, seconds or meters, comma-separated.",
 )
@@ -95,7 +94,7 @@ def evaluate(
         draw_evaluated(png, {name: (each.aligned, each.reference) for name, each in evaluated.items()})
     trees = {name: _tree(results) for name, results in evaluated.items()}
     tree = trees if len(trees) > 1 else trees.popitem()[1]
-    click.echo(options.json_text(tree) if as_json else _text(evaluated, is_verbose=verbose))
+    click.echo(json_text(tree) if as_json else _text(evaluated, is_verbose=verbose))
     if png is not None and not as_json:
         click.echo(f"written {png}")
 

@@ -13,6 +13,7 @@ from click.core import ParameterSource
 from scanchain.commands import options
 from scanchain.commands.options import PATH
 from scanchain.errors import InputError, folded
+from scanchain.files import json_text, write_json
 
 if TYPE_CHECKING:
     from scanchain.landmarks.ranges import OdometryNoise
@@ -37,7 +38,6 @@ _ALONE = {  # options that apply to one kind of problem only
     "--method",
     "methods",
     default="schur",
-    show_default=True,
     metavar="NAME,...",
     help="Linear solvers: one to solve with, several (or all) to compare.",
 )
@@ -46,14 +46,12 @@ _ALONE = {  # options that apply to one kind of problem only
     "repeats",
     type=click.IntRange(1, 1000),
     default=3,
-    show_default=True,
     help="Timed repetitions; the median is reported.",
 )
 @click.option(
     "--robot",
     "robots",
     default="1",
-    show_default=True,
     metavar="N,...",
     help="Robots of an MRCLAM folder, or all; several are estimated in one problem, as they see each other.",
 )
@@ -72,14 +70,12 @@ _ALONE = {  # options that apply to one kind of problem only
     "--guess",
     type=click.Choice(["odometry", "disturbed", "origin"]),
     default="odometry",
-    show_default=True,
     help="Initial guess of a nonlinear file: odometry, disturbed by 1 m and 0.5 rad, or landmarks at the origin.",
 )
 @click.option(
     "--optimizer",
     type=click.Choice(["levenberg-marquardt", "gauss-newton", "gradient-descent"]),
     default="levenberg-marquardt",
-    show_default=True,
     help="Optimizer for a nonlinear file.",
 )
 @click.option("--recording", metavar="FILE.rrd", type=PATH, help="Record before and after for rerun.")
@@ -140,8 +136,8 @@ def landmarks(
         _check_names(studies)
         for study in studies:
             write_estimate(directory.path, study)
-        figures = options.json_text({"problems": [tree_of(study) for study in studies]})
-        (directory.path / "metrics.json").write_text(f"{figures}\n", encoding="utf-8")
+        tree = {"problems": [tree_of(study) for study in studies]}
+        write_json(directory.path / "metrics.json", tree)
         directory.end()
         write_report(directory.path, studies)
         if recording is not None:
@@ -149,7 +145,7 @@ def landmarks(
 
             record_landmarks(studies, recording)
         directory.complete()
-    click.echo(figures if as_json else folded("\n\n".join(map(text_of, studies))))
+    click.echo(json_text(tree) if as_json else folded("\n\n".join(map(text_of, studies))))
     if not as_json:
         click.echo("".join(f"\nwritten        {path}" for path in (out, recording) if path is not None))
     return int(not all(study.converged for study in studies))

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scanchain.commands import options
-from scanchain.commands.options import LOG, PATH, OverrideCommand
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.errors import InputError, counted, folded
-from scanchain.files import Source
+from scanchain.files import Source, json_text, source_of
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def info(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...
 
     config = load_settings(overrides=overrides).config
     found = describe(logs, config.log, uses_imu=config.odometry.imu)
-    click.echo(options.json_text(found) if as_json else _info_text(found))
+    click.echo(json_text(found) if as_json else _info_text(found))
     return int(bool(found["problem"]))
 
 
@@ -60,12 +60,9 @@ def _info_text(log: dict[str, Any]) -> str:
     if log["lidar"]:
         import numpy as np
 
-        from scanchain.logs.mounting import turned_by
+        from scanchain.logs.mounting import place_text
 
-        T_base_lidar = np.array(log["T_base_lidar"])
-        place = ", ".join(f"{axis} {at_m:.3f} m" for axis, at_m in zip("xyz", T_base_lidar[:-1, -1], strict=False))
-        turned = turned_by(T_base_lidar)
-        at = f"at {place} on {log['base_frame']}{turned and f', turned by {turned}'}"
+        at = f"at {place_text(np.array(log['T_base_lidar']), log['base_frame'])}"
         if not log["base_frame"]:
             at = "assumed at the robot's origin: no transform states it" + (
                 "; a run estimates it from the wheels" if log["odometry"] else ""
@@ -118,7 +115,7 @@ def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, .
     with Terminal("scans") as terminal:
         log_config = load_settings(overrides=overrides).config.log
         found = examine(logs, config_for, log_config, terminal.count, distortion_of, delay_of_wheels)
-    click.echo(options.json_text(found) if as_json else folded(_doctor_text(found)))
+    click.echo(json_text(found) if as_json else folded(_doctor_text(found)))
 
 
 def _doctor_text(found: Diagnosis) -> str:
@@ -131,7 +128,7 @@ def _doctor_text(found: Diagnosis) -> str:
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
-@click.argument("source", metavar="SRC", type=LOG)
+@click.argument("source", metavar="SRC", type=source_of)
 @click.argument("destination", metavar="DST.mcap", type=PATH)
 @options.key(
     "--rate",
@@ -184,7 +181,7 @@ def convert(
         click.echo(f"warning: {line}", err=True)
     if as_json:
         reported = {"path": str(done.path), "messages": done.messages, "notes": done.notes, "damage": done.damage}
-        click.echo(options.json_text(reported))
+        click.echo(json_text(reported))
         return
     for note in done.notes:
         click.echo(f"note: {note}", err=True)
@@ -194,18 +191,14 @@ def convert(
 @click.command()
 @click.argument("world", metavar="WORLD")
 @click.argument("destination", metavar="DST.mcap", type=PATH)
-@click.option(
-    "--seed", default=0, show_default=True, metavar="N", help="Random seed; the same seed gives the same bytes."
-)
+@click.option("--seed", default=0, metavar="N", help="Random seed; the same seed gives the same bytes.")
 @click.option(
     "--duration", "duration_s", type=float, metavar="SECONDS", help="Length of the drive. [default: the world's]"
 )
 @click.option("--sensor", metavar="NAME", help="Lidar: lms-270, utm-30, hdl-64, os1-32, vlp-16 or rosette.")
 @click.option("--imu", metavar="NAME", help="Add an IMU at 200 Hz, one of those above. [default: none]")
 @click.option("--gnss", metavar="NAME", help="Add a GNSS receiver at 10 Hz, one of those above. [default: none]")
-@click.option(
-    "--drift", default=1.0, show_default=True, metavar="FACTOR", help="Scale of the errors of the wheel odometry."
-)
+@click.option("--drift", default=1.0, metavar="FACTOR", help="Scale of the errors of the wheel odometry.")
 @click.option(
     "--wheels-slip",
     nargs=3,
@@ -217,7 +210,6 @@ def convert(
     "--wheels-delay",
     "wheels_delay_s",
     default=0.0,
-    show_default=True,
     metavar="SECONDS",
     help="How late the stamps of the wheels are.",
 )
@@ -238,13 +230,10 @@ def convert(
     help="Drive again on another day, number N: furniture or parked cars came, went and moved.",
 )
 @click.option("--reverse", is_flag=True, help="Drive the route the other way round.")
-@click.option(
-    "--start-at", "start_m", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route."
-)
+@click.option("--start-at", "start_m", default=0.0, metavar="METERS", help="Begin so far along the route.")
 @click.option(
     "--pace",
     default=1.0,
-    show_default=True,
     metavar="FACTOR",
     help="Drive so many times as fast; at 1.67 the world turns has turns of 200 deg/s.",
 )

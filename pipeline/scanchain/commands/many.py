@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scanchain.commands import options
-from scanchain.commands.options import LOG, PATH, OverrideCommand
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.errors import InputError, ScanchainError, counted, folded
-from scanchain.files import Source
+from scanchain.files import Source, source_of
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def _variations(_: object, __: object, words: Sequence[str]) -> dict[str, list[s
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
+@click.argument("logs", metavar="LOG...", nargs=-1, type=source_of)
 @options.out("Directory to create, or to resume.")
 @click.option(
     "--manifest", "manifests", multiple=True, metavar="FILE", type=PATH, help="Text file with one log per line."
@@ -54,18 +54,11 @@ def _variations(_: object, __: object, words: Sequence[str]) -> dict[str, list[s
 @options.limits(
     "a log", time_default="a day", memory_default="an equal share of three quarters of the free memory"
 )
-@click.option(
-    "--retries",
-    type=click.IntRange(0),
-    default=1,
-    show_default=True,
-    help="Retries of a log whose process crashed.",
-)
+@click.option("--retries", type=click.IntRange(0), default=1, help="Retries of a log whose process crashed.")
 @click.option(
     "--rerun",
     type=click.Choice(["save", "off"]),
     default="save",
-    show_default=True,
     help="Whether runs write a recording, some ten megabytes each.",
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 unless every verdict is trustworthy.")
@@ -143,6 +136,7 @@ def batch(
     "--matcher",
     metavar="MODULE:CLASS",
     default="",
+    show_default=False,
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
 @click.option(
@@ -162,9 +156,7 @@ def batch(
     type=PATH,
     help="TOML file on top of the preset, with a table for each method whose settings differ.",
 )
-@click.option(
-    "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, interleaved."
-)
+@click.option("--repeat", type=click.IntRange(1), default=1, help="Runs of every method, interleaved.")
 @options.limits("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
 @options.part()
 @options.threads

@@ -43,7 +43,6 @@ def map_group() -> None:
     "height_m",
     type=ABOVE_ZERO,
     default=1.6,
-    show_default=True,
     metavar="METERS",
     help="Of the lidar above the ground.",
 )
@@ -174,7 +173,6 @@ def merge(runs: tuple[Path, ...], out: Path, fixed: bool, update: bool, as_json:
     "min_size_m",
     type=ABOVE_ZERO,
     default=0.2,
-    show_default=True,
     metavar="METERS",
     help="Least length of a change; what is smaller is unknown.",
 )

@@ -13,6 +13,7 @@ from scanchain.commands import options
 from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.data import DOWNWEIGHTED
 from scanchain.errors import FREEDOM, InputError, counted, folded
+from scanchain.files import json_text
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
     "--initialize",
     type=click.Choice(_INITIALIZATIONS),
     default="auto",
-    show_default=True,
     help="Initial guess; auto takes the file's, or the chordal one if that is poor.",
 )
 @options.key(
@@ -56,14 +56,12 @@ _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
     "--indefinite",
     type=click.Choice(("project", "refuse")),
     default="project",
-    show_default=True,
     help="Information matrices that are not positive semidefinite: project to the nearest that is, or refuse.",
 )
 @click.option(
     "--noise",
     type=click.Choice(("auto", "information", "covariance", "square-root")),
     default="auto",
-    show_default=True,
     help="What the matrices in the lines are; auto is information, and covariance where GTSAM has that.",
 )
 @click.option(
@@ -128,7 +126,7 @@ def optimize(
     written = _write(file, change, chosen, out, png, recording)
     lines = [*report.lines(), *(("written", path) for path in written)]
     text = "\n".join(f"{name:<15}{fact}" for name, fact in lines)
-    click.echo(options.json_text(report.tree() | {"written": written}) if as_json else folded(text))
+    click.echo(json_text(report.tree() | {"written": written}) if as_json else folded(text))
     return int(not done.converged)
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import msgspec
 
 from scanchain.config import NO_TOPIC
 from scanchain.errors import InputError
@@ -87,8 +86,7 @@ def key(flag: str, name: str, *, value: str | None = None, **attributes: Any) ->
     return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
 
 
-LOG = source_of
-logs = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+logs = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=source_of)
 
 
 def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -194,11 +192,6 @@ def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
     click.echo((out / "metrics.json").read_text(encoding="utf-8") if as_json else shortened(summary), nl=False)
     if not as_json:
         click.echo(f"written        {out}")
-
-
-def json_text(tree: object) -> str:
-    """Records, dictionaries and NumPy numbers as indented JSON; non-finite numbers become null."""
-    return msgspec.json.format(msgspec.json.encode(tree, enc_hook=lambda number: number.item()), indent=2).decode()
 
 
 def limits(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:

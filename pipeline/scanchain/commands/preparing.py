@@ -15,6 +15,7 @@ from scanchain.commands import options
 from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.config_keys import Value
 from scanchain.errors import ScanchainError
+from scanchain.files import json_text
 from scanchain.settings import Override, Settings, config_keys, dump, flatten, load_settings
 
 _INDENT = 6 * " "
@@ -62,7 +63,7 @@ def show(settings: Settings, as_json: bool) -> None:
             {"key": name, "value": values[name]} | {each: getattr(key, each) for each in names}
             for name, key in keys.items()
         ]
-        click.echo(options.json_text(rows))
+        click.echo(json_text(rows))
         return
     click.echo(f"# {settings.source}; * differs from the default")
     cells = [
@@ -120,7 +121,7 @@ def list_sequences(as_json: bool) -> None:
 
     entries = {name: catalog.load(name) for name in catalog.names()}
     if as_json:
-        click.echo(options.json_text(entries))
+        click.echo(json_text(entries))
         return
     width = max(map(len, entries))
     for name, entry in entries.items():
@@ -130,9 +131,7 @@ def list_sequences(as_json: bool) -> None:
 
 @sequence.command("get")
 @click.argument("name", metavar="NAME")
-@click.option(
-    "--out", default=Path("logs"), show_default=True, metavar="DIR", type=PATH, help="Folder of the log."
-)
+@click.option("--out", default=Path("logs"), metavar="DIR", type=PATH, help="Folder of the log.")
 @click.option("--force", is_flag=True, help="Make it again even if it exists.")
 @options.as_json
 def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
@@ -152,7 +151,7 @@ def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
     unit = "MiB" if isinstance(catalog.load(name).source, catalog.Download) else "scans"
     with Terminal(unit) as terminal:
         path = catalog.prepare(name, out, force=force, progress=terminal.count)
-    click.echo(options.json_text({"name": name, "path": str(path)}) if as_json else path)
+    click.echo(json_text({"name": name, "path": str(path)}) if as_json else path)
 
 
 @click.command()

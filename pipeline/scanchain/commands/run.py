@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scanchain.commands import options
-from scanchain.commands.options import LOG, PATH, NumberRange, OverrideCommand
+from scanchain.commands.options import PATH, NumberRange, OverrideCommand
 from scanchain.errors import InputError, ScanchainError, counted, folded
-from scanchain.files import Source
+from scanchain.files import Source, json_text, source_of
 from scanchain.settings import Override
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.option(
     "--rerun",
     default="save",
-    show_default=True,
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
@@ -45,7 +44,6 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     "checkpoint_s",
     type=NumberRange(0.0),
     default=10.0,
-    show_default=True,
     metavar="SECONDS",
     help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
@@ -121,7 +119,7 @@ def _sinks(text: str) -> frozenset[SinkName]:
 
 
 @click.command(cls=OverrideCommand)
-@click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
+@click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=source_of)
 @click.option("--trajectory", metavar="FILE.tum", type=PATH, help="Check this trajectory of the lidar in LOG.")
 @options.part()
 @options.strict
@@ -166,7 +164,7 @@ def check(
         "verdict_error": judged.error,
         "segments": judged.segments,
     }
-    click.echo(options.json_text(tree) if as_json else text)
+    click.echo(json_text(tree) if as_json else text)
     return int(judged.verdict.fails(strict=strict))
 
 
@@ -191,19 +189,13 @@ def view(directory: Path, web: bool, png: Path | None, gif: Path | None, force: 
     """
     from scanchain.commands.terminal import Terminal
 
-    if png is not None:
+    if picture := png or gif:
+        from scanchain_viz.pictures.animation import draw_growing_map
         from scanchain_viz.pictures.maps import draw_run
 
-        options.check_output(png, force=force, endings=(".png",))
-        draw_run(directory, png)
-        click.echo(png)
-        return
-    if gif is not None:
-        from scanchain_viz.pictures.animation import draw_growing_map
-
-        options.check_output(gif, force=force, endings=(".gif",))
-        draw_growing_map(directory, gif)
-        click.echo(gif)
+        options.check_output(picture, force=force, endings=(".png" if png else ".gif",))
+        (draw_run if png else draw_growing_map)(directory, picture)
+        click.echo(picture)
         return
     path = directory / "recording.rrd" if directory.is_dir() else directory
     if not path.exists() or path.suffix != ".rrd":

@@ -19,7 +19,7 @@ from scanchain.comparison.processes import Status
 from scanchain.comparison.table import COLUMNS, Column, Row, Table, lined_up
 from scanchain.data import Matrix, Vector
 from scanchain.errors import counted, folded
-from scanchain.files import write_whole
+from scanchain.files import write_json, write_whole
 from scanchain.verdict import Verdict
 
 OVERALL_FILE = "overall.json"
@@ -247,7 +247,7 @@ def write_overall(folder: Path, overall: Overall) -> None:
         "friedman_p": overall.friedman_p,
         "columns": FIGURES,
     }
-    write_whole(folder / OVERALL_FILE, msgspec.json.format(msgspec.json.encode(tree), indent=2) + b"\n")
+    write_json(folder / OVERALL_FILE, tree)
     with (folder / "overall.csv").open("w", encoding="utf-8") as file:  # every figure in its own unit
         writer = csv.writer(file, lineterminator="\n")
         keys = [f"{column.key}{part}" for column in FIGURES for part in ("", "_low", "_high", "_logs")]

@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from scanchain.comparison.processes import Status
 from scanchain.errors import folded
+from scanchain.files import write_json
 from scanchain.runs.provenance import Provenance
 from scanchain.verdict import Judged, Verdict
 
@@ -217,7 +218,7 @@ class Table(Struct, frozen=True):
 def write_table(folder: Path, table: Table) -> None:
     """table.json, table.csv and table.md."""
     tree = msgspec.to_builtins(table) | {"columns": msgspec.to_builtins(COLUMNS)}
-    (folder / TABLE_FILE).write_bytes(msgspec.json.format(msgspec.json.encode(tree), indent=2) + b"\n")
+    write_json(folder / TABLE_FILE, tree)
     keys = [column.key for column in COLUMNS]
     with (folder / "table.csv").open("w", encoding="utf-8") as file:  # every figure in its own unit
         writer = csv.writer(file, lineterminator="\n")

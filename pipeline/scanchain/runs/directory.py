@@ -11,13 +11,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import msgspec
 import psutil
+from msgspec import structs
 
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.errors import InputError
-from scanchain.files import Source, write_whole
+from scanchain.files import Source, write_json, write_whole
 from scanchain.georeference import Origin
 from scanchain.runs.provenance import Hashing, describe_start, log_file
 from scanchain.settings import dump
@@ -89,10 +89,10 @@ class RunDirectory:
 
     def begin(self, configuration: str = "", config: Config | None = None) -> None:
         """Write run.json and the configuration, which is also described in words."""
-        self.provenance = msgspec.structs.replace(
+        self.provenance = structs.replace(
             self.provenance, configuration=configuration, logs=[log_file(source) for source in self.sources]
         )
-        self.provenance.write(self.path / RUN_FILE)
+        write_json(self.path / RUN_FILE, self.provenance)
         if config is not None:
             write_whole(self.path / CONFIG_FILE, dump(config).encode())
 
@@ -101,13 +101,15 @@ class RunDirectory:
         origin: Origin | None = None,
     ) -> None:  # fmt: skip
         """Write the final run.json; of a complete result, with the hashes of its sources."""
+        logs = self.provenance.logs
         if is_complete:
-            self.provenance = self.provenance.hashed(self.hashing.digests())
+            hashed = zip(logs, self.hashing.digests(), strict=True)
+            logs = [structs.replace(file, sha256=digest) for file, digest in hashed]
         duration_s = working_s() - self.began_s if duration_s is None else duration_s
-        self.provenance = msgspec.structs.replace(
-            self.provenance, complete=is_complete, stopped=stopped, duration_s=duration_s, origin=origin
+        self.provenance = structs.replace(
+            self.provenance, complete=is_complete, stopped=stopped, duration_s=duration_s, logs=logs, origin=origin
         )
-        self.provenance.write(self.path / RUN_FILE)
+        write_json(self.path / RUN_FILE, self.provenance)
 
     def worth_keeping(self) -> None:
         """Retain the directory, marked partial, even if the run fails."""
@@ -147,7 +149,7 @@ class RunDirectory:
 
 def write_figures(folder: Path, metrics: object, summary: str) -> None:
     """Write metrics.json, in which values that are not finite become null, and summary.txt."""
-    write_whole(folder / METRICS_FILE, msgspec.json.format(msgspec.json.encode(metrics), indent=2) + b"\n")
+    write_json(folder / METRICS_FILE, metrics)
     write_whole(folder / SUMMARY_FILE, summary.encode())
 
 

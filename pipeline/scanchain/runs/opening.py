@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import NO_TOPIC, Config
-from scanchain.data import Scan, Trajectory
+from scanchain.data import Trajectory
 from scanchain.errors import InputError, counted
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
 from scanchain.files import Source
@@ -47,10 +47,6 @@ class Opened:
     def stopped_after(self, count: int) -> str:
         """Why the log ended after so many scans; empty if it was not stopped."""
         return f"stopped by the user after {counted(count, 'scan')}" if self.progress.stopped else ""
-
-    def scans_again(self) -> Generator[Scan, None, None]:
-        """The scans of the log, opened once more."""
-        return open_log(self.sources, self.log.config).scans(self.config.preprocess)
 
     def true_poses(self, stamps_ns: NDArray[np.int64]) -> Trajectory | None:
         """True poses, of a KITTI file those of the scans (N,) before a stop. Raises InputError."""

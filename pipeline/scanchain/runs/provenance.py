@@ -11,11 +11,10 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import msgspec
-from msgspec import Struct, structs
+from msgspec import Struct
 
 from scanchain.errors import InputError
-from scanchain.files import Source, without_keys, write_whole
+from scanchain.files import Source, without_keys
 from scanchain.georeference import Origin
 from scanchain.logs.files import RemoteFile, files_of, size_of
 
@@ -53,15 +52,6 @@ class Provenance(Struct, frozen=True):
     cores: int
     versions: dict[str, str]
     origin: Origin | None = None
-
-    def write(self, path: Path) -> None:
-        """Write as JSON, atomically."""
-        write_whole(path, msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
-
-    def hashed(self, digests: Sequence[str]) -> Provenance:
-        """Copy with the hashes of its logs."""
-        logs = [structs.replace(file, sha256=digest) for file, digest in zip(self.logs, digests, strict=True)]
-        return structs.replace(self, logs=logs)
 
 
 def describe_start(command: Sequence[str]) -> Provenance:

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import lie, maps
 from scanchain.config import Config, MapsConfig
 from scanchain.data import Closure, Influence, Keyframe, Matrix, Points, Pose, Scan, Trajectory
 from scanchain.errors import InputError
@@ -22,24 +22,6 @@ from scanchain.evaluation import ExpectedError, ExpectedErrors, ScanPoses, expec
 from scanchain.graph.g2o import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import level_of, outline_of
-from scanchain.maps import (
-    MAP_FOLDER,
-    Edges,
-    OccupancyGrid,
-    SavedMap,
-    Session,
-    View,
-    build_point_map,
-    draw_grid,
-    fitting_resolution,
-    moved,
-    open_saved_map,
-    write_laz,
-    write_map,
-    write_pcd,
-    write_ply,
-    write_saved_map,
-)
 from scanchain.odometry.jackknife import influence
 from scanchain.runs.closures import closures_table
 from scanchain.runs.evidence import evidence_of
@@ -79,7 +61,7 @@ class Results:
     result: SlamResult
     final: tuple[Closure, ...]
     cloud_ahead: Future[Cloud]
-    grid: OccupancyGrid
+    grid: maps.OccupancyGrid
     T_world_level: Pose
 
     @cached_property
@@ -120,14 +102,14 @@ def _write_saved_map(path: Path, results: Results) -> None:
     chosen = np.flatnonzero(result.components == np.bincount(result.components).argmax())
     poses = result.T_world_keyframes
     keyframes = tuple(replace(result.keyframes[k], T_odom_lidar=poses[k]) for k in chosen.tolist())
-    edges = Edges(graph.edges, graph.measurements, graph.information, graph.is_loop, graph.weight)
+    edges = maps.Edges(graph.edges, graph.measurements, graph.information, graph.is_loop, graph.weight)
     in_force = edges.where(~graph.is_rejected & (graph.is_odometry | graph.is_loop)).among(chosen)
     stamps_ns = result.trajectory.stamps_ns
-    session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
+    session = maps.Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)
-    write_saved_map(SavedMap(path, graph.dimension, keyframes, numbers, (session,), in_force))
+    maps.write_saved_map(maps.SavedMap(path, graph.dimension, keyframes, numbers, (session,), in_force))
     if result.config.loops.enabled and graph.dimension == 3:
-        outline_of(path, open_saved_map(path).keyframes, result.config.local_map)
+        outline_of(path, maps.open_saved_map(path).keyframes, result.config.local_map)
 
 
 def results_of(log: Log, result: SlamResult, final: tuple[Closure, ...]) -> Results:
@@ -214,16 +196,16 @@ def write_results(folder: Path, results: Results) -> None:
         write_g2o(rejected_path(folder / GRAPH_FILE), graph, edges="rejected")
     write_table(folder / "loops.parquet", results.closures_table)
     write_table(folder / "steps.parquet", results.steps_table)
-    write_map(folder, results.grid)
+    maps.write_map(folder, results.grid)
     if config.outputs.map:
-        _write_saved_map(folder / MAP_FOLDER, results)
+        _write_saved_map(folder / maps.MAP_FOLDER, results)
     points = results.cloud.points
-    write_ply(folder / "map.ply", points)
+    maps.write_ply(folder / "map.ply", points)
     if config.maps.write_pcd:
-        write_pcd(folder / "map.pcd", points)
+        maps.write_pcd(folder / "map.pcd", points)
     if config.maps.write_laz:
         projected, crs = (points, None) if place is None else place.projected(points)
-        write_laz(folder / "map.laz", projected, crs)
+        maps.write_laz(folder / "map.laz", projected, crs)
     if config.outputs.mcap:  # after the maps, which it reads
         write_results_mcap(folder / "results.mcap", log, result, results.T_world_level)
 
@@ -240,7 +222,7 @@ def record_results(recording: Recorder, results: Results) -> None:
         recording.log_grid(occupancy(grid), resolution_m=grid.resolution_m, origin_m=(x_m, y_m))
 
 
-def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
+def occupancy(grid: maps.OccupancyGrid) -> NDArray[np.int8]:
     """Cells in the convention of ROS: 0 free to 100 occupied, −1 unknown."""
     return np.where(grid.drawn > 0, np.rint(100.0 * grid.probability()), -1.0).astype(np.int8)
 
@@ -248,26 +230,26 @@ def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
 def cloud_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Cloud:
     """The cloud of keyframes at their final poses (K, d+1, d+1), without moving objects if so configured."""
     scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
-    built = build_point_map(scans, dimension=poses.shape[-1] - 1, voxel_size_m=config.maps.voxel_size_m)
+    built = maps.build_point_map(scans, dimension=poses.shape[-1] - 1, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()
     if not config.maps.remove_moving:
         return Cloud(points, 0)
-    gone = moved(points, built.voxel_size_m, views_of(keyframes, poses, config))
+    gone = maps.moved(points, built.voxel_size_m, views_of(keyframes, poses, config))
     return Cloud(points[~gone], int(gone.sum()))
 
 
-def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Iterator[View]:
+def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Iterator[maps.View]:
     """Free space of keyframes at their final poses (K, d+1, d+1)."""
     for T, keyframe in zip(poses, keyframes, strict=True):
         for T_world_origin, points in keyframe.views(T):
-            yield View(T_world_origin, points, keyframe.scale * config.preprocess.map_voxel_m)
+            yield maps.View(T_world_origin, points, keyframe.scale * config.preprocess.map_voxel_m)
 
 
-def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
+def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> maps.OccupancyGrid:
     """The grid of keyframes at poses (K, d+1, d+1), coarser than configured where it would be too large."""
-    resolution_m = fitting_resolution(
+    resolution_m = maps.fitting_resolution(
         poses, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
     )
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
     views = (each for T, keyframe in zip(poses, keyframes, strict=True) for each in keyframe.views(T))
-    return draw_grid(views, fitting)
+    return maps.draw_grid(views, fitting)

@@ -9,18 +9,8 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix, Pose
-from scanchain.logs import Log
+from scanchain.logs import Log, writer
 from scanchain.logs.mounting import MovingFrame, moving_frame
-from scanchain.logs.writer import (
-    Link,
-    LogWriter,
-    pack_cloud,
-    pack_grid,
-    pack_odometry,
-    pack_path,
-    pack_transforms,
-    place,
-)
 from scanchain.maps import read_map, read_ply
 from scanchain.slam import SlamResult
 from scanchain.steps import Steps
@@ -39,20 +29,20 @@ def write_results_mcap(path: Path, log: Log, result: SlamResult, T_world_grid: P
     moving = moving_frame(log.indexes, log.publishers.frame, log.mounting, dimension=log.dimension)
     steps = result.steps
     first_ns, first_log_ns = (int(steps.columns[name][0]) for name in ("stamp_ns", "log_time_ns"))
-    with LogWriter(path) as writer:
+    with writer.LogWriter(path) as file:
         trajectory = result.trajectory
-        places = [place(T @ moving.T_lidar_frame) for T in trajectory.poses]
-        data = pack_path(first_ns, _WORLD, trajectory.stamps_ns.tolist(), places)
-        writer.append("/path", "nav_msgs/msg/Path", data, first_ns, first_log_ns)
+        places = [writer.place(T @ moving.T_lidar_frame) for T in trajectory.poses]
+        data = writer.pack_path(first_ns, _WORLD, trajectory.stamps_ns.tolist(), places)
+        file.append("/path", "nav_msgs/msg/Path", data, first_ns, first_log_ns)
         cells, resolution_m, origin_m = read_map(path.parent)
         T_grid_corner = lie.identity(log.dimension)
         T_grid_corner[:2, -1] = origin_m
-        data = pack_grid(first_ns, _WORLD, cells, resolution_m, place(T_world_grid @ T_grid_corner))
-        writer.append("/map", "nav_msgs/msg/OccupancyGrid", data, first_ns, first_log_ns)
+        data = writer.pack_grid(first_ns, _WORLD, cells, resolution_m, writer.place(T_world_grid @ T_grid_corner))
+        file.append("/map", "nav_msgs/msg/OccupancyGrid", data, first_ns, first_log_ns)
         points = lie.lift_points(read_ply(path.with_name("map.ply"))).astype("<f4")
-        data = pack_cloud(first_ns, _WORLD, points.view([(name, "<f4") for name in "xyz"])[:, 0])
-        writer.append("/map_cloud", "sensor_msgs/msg/PointCloud2", data, first_ns, first_log_ns)
-        _write_motion(writer, moving, steps, trajectory.poses)
+        data = writer.pack_cloud(first_ns, _WORLD, points.view([(name, "<f4") for name in "xyz"])[:, 0])
+        file.append("/map_cloud", "sensor_msgs/msg/PointCloud2", data, first_ns, first_log_ns)
+        _write_motion(file, moving, steps, trajectory.poses)
 
 
 def ros_covariance(covariance: Matrix, T: Pose) -> NDArray[np.float64]:
@@ -69,7 +59,7 @@ def ros_covariance(covariance: Matrix, T: Pose) -> NDArray[np.float64]:
     return turn @ spread @ turn.T
 
 
-def _write_motion(writer: LogWriter, moving: MovingFrame, steps: Steps, poses: Matrix) -> None:
+def _write_motion(file: writer.LogWriter, moving: MovingFrame, steps: Steps, poses: Matrix) -> None:
     T_lidar_frame = moving.T_lidar_frame
     adjoint = lie.adjoint(lie.inverse(T_lidar_frame))
     stamps_ns, log_times_ns = (steps.columns[name].tolist() for name in ("stamp_ns", "log_time_ns"))
@@ -78,10 +68,10 @@ def _write_motion(writer: LogWriter, moving: MovingFrame, steps: Steps, poses: M
     for stamp_ns, log_time_ns, T_odom_lidar, T_world_lidar, covariance in rows:
         T_odom_frame = T_odom_lidar @ T_lidar_frame
         T_world_odom = T_world_lidar @ lie.inverse(T_odom_lidar)
-        here = place(T_odom_frame)
-        links = Link(_WORLD, _ODOM, place(T_world_odom)), Link(_ODOM, moving.name, here)
-        data = pack_transforms(stamp_ns, *links)
-        writer.append("/tf", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
+        here = writer.place(T_odom_frame)
+        links = writer.Link(_WORLD, _ODOM, writer.place(T_world_odom)), writer.Link(_ODOM, moving.name, here)
+        data = writer.pack_transforms(stamp_ns, *links)
+        file.append("/tf", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
         in_ros = ros_covariance(adjoint @ covariance @ adjoint.T, T_odom_frame)
-        data = pack_odometry(stamp_ns, _ODOM, moving.name, here, in_ros)
-        writer.append("/odometry", "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
+        data = writer.pack_odometry(stamp_ns, _ODOM, moving.name, here, in_ros)
+        file.append("/odometry", "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)

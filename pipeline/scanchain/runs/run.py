@@ -16,6 +16,7 @@ from scanchain.data import Scan, Trajectory, brief
 from scanchain.errors import InputError, OwnCodeError, ScanchainError, counted
 from scanchain.evaluation import ExpectedErrors, on_the_estimate
 from scanchain.georeference import Georeference
+from scanchain.logs import open_log
 from scanchain.logs.topics import other_sensors
 from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
@@ -173,7 +174,8 @@ class _Run:
                 "measuring systematic errors: odometry without one group of directions after the other"
             )
             try:
-                with closing(self.source.scans_again()) as scans:
+                again = open_log(self.source.sources, self.log.config)
+                with closing(again.scans(self.config.preprocess)) as scans:
                     return expected_of(result, scans, self.log.distorted_share)
             except (InputError, OSError) as error:
                 self.notes.append(f"error bars of random errors only: {error}")
