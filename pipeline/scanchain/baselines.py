@@ -242,9 +242,6 @@ class GenzSettings(Struct, frozen=True, forbid_unknown_fields=True):
     preset: Preset = "outdoor"
 
 
-GENZ = GenzSettings()
-
-
 class GenzIcp:
     """GenZ-ICP with a preset of its authors.
 
@@ -252,7 +249,7 @@ class GenzIcp:
     static variable: a second odometry in the same process starts with the voxel size of the first.
     """
 
-    def __init__(self, settings: GenzSettings = GENZ) -> None:
+    def __init__(self, settings: GenzSettings) -> None:
         preset = settings.preset
         library = _imported("genz_icp.genz_icp", "genz-icp")
         config = _imported("genz_icp.config", "genz-icp").load_config(None)
@@ -286,13 +283,10 @@ class RkoSettings(Struct, frozen=True, forbid_unknown_fields=True):
     threads: Annotated[int, Meta(ge=0)] = 0
 
 
-RKO = RkoSettings()
-
-
 class RkoLio:
     """RKO-LIO: point-to-point, scan to map, with gyro and accelerometer."""
 
-    def __init__(self, settings: RkoSettings = RKO) -> None:
+    def __init__(self, settings: RkoSettings) -> None:
         library = _imported("rko_lio.lio", "rko-lio")
         config = _imported("rko_lio.config", "rko-lio").LIOConfig(
             min_range=settings.min_range_m,
@@ -331,9 +325,6 @@ class RkoLio:
         since_ns = np.rint(1e9 * times).astype(np.int64) if len(times) else np.zeros(len(frame), np.int64)
         self.odometry.register_scan(frame, stamp_ns + since_ns)
         return self.at_stamp.move(self.odometry.pose(), stamp_ns, float(times.max(initial=0.0)))
-
-
-_CLEAR_CYCLE = 10  # of small_gicp's own odometry example, as are the defaults below
 
 
 class GicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -433,7 +424,7 @@ class SmallGicpModel(_SmallGicp):
     def __init__(self, settings: VgicpSettings = VGICP) -> None:
         super().__init__(settings)
         self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
-        self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
+        self.map.set_lru(horizon=settings.horizon, clear_cycle=10)
         self.description = (
             f"small_gicp VGICP, scan to map, downsampled to {settings.downsampling_m:g} m, voxels of "
             f"{settings.voxel_size_m:g} m, {self.threads} threads, constant velocity, no deskewing"
@@ -556,8 +547,8 @@ BASELINES: dict[str, Entry] = {
     "kiss-slam": Entry(KissSlam, "kiss-slam", KISS_SLAM, None),
     "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),
     "small-vgicp": Entry(SmallGicpModel, "small-gicp", VGICP, PLANAR_VGICP, is_raised=True),
-    "genz-icp": Entry(GenzIcp, "genz-icp", GENZ, None, forgets=False),
+    "genz-icp": Entry(GenzIcp, "genz-icp", GenzSettings(), None, forgets=False),
     "genz-icp-indoor": Entry(GenzIcp, "genz-icp", GenzSettings("indoor"), None, forgets=False),
     "genz-icp-kitti": Entry(GenzIcp, "genz-icp", GenzSettings("kitti"), None, forgets=False),
-    "rko-lio": Entry(RkoLio, "rko-lio", RKO, None, wants_imu=True),
+    "rko-lio": Entry(RkoLio, "rko-lio", RkoSettings(), None, wants_imu=True),
 }

@@ -30,7 +30,6 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _set = object.__setattr__  # sets a field of a frozen record that checks itself
-_SHOWN = 60  # longest text of a value in the ``repr`` of a record
 
 GRAVITY_M_S2, _UNIT = 9.81, 1.3  # and largest ratio of it and the specific force at rest
 BRIDGED_S = 0.15  # longest time between two samples of an IMU in use
@@ -59,7 +58,7 @@ def _brief(value: object) -> str:
         return f"<{' × '.join(map(str, value.shape))}>"
     text = f"{value:.6g}" if isinstance(value, float) else repr(value)
     size = f" of {len(value):,}" if isinstance(value, Sized) else ""
-    return text if len(text) <= _SHOWN else f"<{type(value).__name__}{size}>"
+    return text if len(text) <= 60 else f"<{type(value).__name__}{size}>"
 
 
 class OtherPoints(NamedTuple):

@@ -204,7 +204,8 @@ class Georeferencing:
         apart, spacing_s = _apart(loose, first)
         keyframes_ns = trajectory.stamps_ns[of_keyframes]
         nearest = np.array([np.abs(keyframes_ns - each).argmin() for each in sighted.stamps_ns[apart]])
-        tied = _tied(graph, nearest, loose.chosen(apart, _STRICT), first, self.up)
+        tied, chosen = graph.in_force(0, len(graph)), loose.chosen(apart, _STRICT)  # its edges are not robust here
+        _constrain(tied, nearest, tied.poses[nearest], chosen, first, self.up, RobustPosition())
         tied.optimize(self.config, initialize="given")
         is_kept = ~tied.is_rejected[tied.is_of_origin][1:]
         if is_kept.sum() < max(_FEWEST, _LEAST_SHARE * len(apart)):
@@ -320,13 +321,6 @@ def _apart(sighted: _Sighted, T_enu_world: Pose) -> tuple[Integers, float]:
         middle = np.abs(times_s[among] / spacing_s - each - 0.5)
         found.append(int(among[np.lexsort([middle, -agree.sum(axis=1)])[0]]))
     return np.array(found), spacing_s
-
-
-def _tied(graph: PoseGraph, keyframes: Integers, sighted: _Sighted, T_enu_world: Pose, up: Vector) -> PoseGraph:
-    """A graph of the edges in force of another one, not robust here, and of robust positions by fixes."""
-    tied = graph.in_force(0, len(graph))
-    _constrain(tied, keyframes, tied.poses[keyframes], sighted, T_enu_world, up, RobustPosition())
-    return tied
 
 
 def _constrain(

@@ -30,7 +30,6 @@ from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
 from scanchain.verdict import Verdict
 
-_NODE_LOSSES = 10  # largest number of retries of a task after its cluster node died
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
     "scans", "dimension", "ok", "contradicted", "degenerate", "lost", "keyframes", "closures_tried",
@@ -199,7 +198,7 @@ def on_cluster(
         connect()  # again after an earlier call
         nodes = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
         cores = max(nodes, default=1.0) if has_whole_node else 1.0
-        remote = ray.remote(num_cpus=cores, max_retries=_NODE_LOSSES)(attempt)
+        remote = ray.remote(num_cpus=cores, max_retries=10)(attempt)  # after its node died
         waiting = [remote.remote(task) for task in tasks]
         try:
             while waiting:

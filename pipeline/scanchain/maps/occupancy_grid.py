@@ -20,7 +20,6 @@ MAX_CELLS = 64_000_000  # largest number of cells: half a gigabyte
 # log-odds of a hit (0.7) and a miss (0.4), and their limits (0.12 and 0.97): Hornung et al. 2013, sec. 5.1
 _LOG_ODDS = (0.85, -0.4, -2.0, 3.5)
 _MARGIN = 2  # cells around all beams; rounding may shift a beam by one cell
-_GROWTH = 0.25  # share of the extent that is added where the grid has to grow
 
 
 class OccupancyGrid:
@@ -117,7 +116,7 @@ class OccupancyGrid:
         lower, upper = lower.astype(np.int64), upper.astype(np.int64)
         if (lower >= 0).all() and (upper <= size).all():
             return
-        spare = (_GROWTH * np.maximum(size, upper - lower)).astype(np.int64)
+        spare = (0.25 * np.maximum(size, upper - lower)).astype(np.int64)
         before = np.where(lower < 0, -lower + spare, 0)
         after = np.where(upper > size, upper - size + spare, 0)
         if np.prod(before + size + after) > MAX_CELLS:
