@@ -20,7 +20,7 @@ from scanchain.graph.consistency import is_bent
 from scanchain.graph.factors import Position, Prior, RobustPosition
 from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.gravity import upright
+from scanchain.gravity import MOUNTED_RAD, upright
 
 _CORRELATED_S, _SPACING_S = 20.0, 5.0  # time constant of the errors of fixes, and usual time between those used
 _FEWEST, _INTERVALS = 4, 12  # least number of them that agree, and number of intervals of a short log
@@ -30,7 +30,7 @@ _DRIFT = 0.01  # of the trajectory, as a share of the distance, that votes toler
 _LEAST_SHARE = 0.35  # of fixes that agree with the trajectory
 _STRICT = 0.5  # factor on the variance for the verdict, by which 4 % of right fixes are left out too
 _LEAST_M = 0.02  # σ of a fix relative to the lidar, beyond that stated: stamps, the antenna's position and tilt
-_TILT_RAD, _ANTENNA_M = 0.05, 1.0  # σ of the vertical by the mounting, and of the antenna's unknown position
+_ANTENNA_M = 1.0  # σ of the antenna's unknown position
 _MOST_RAD = math.radians(15.0)  # σ of the direction above which the place is unknown
 _SURE, _MOST_ALONE = 0.999, 0.1  # probability that errors as stated pass a test; share of fixes that fail it alone
 _HEIGHT_M = 1e3  # σ of heights in the plane, where they are unknown
@@ -333,7 +333,7 @@ def _constrain(
         np.eye(graph.freedom) * _FREE_M**-2.0,
         upright(up) @ lie.lift(graph.poses[0])[:3, :3],
     )
-    of_rotation = R_up_lidar.T @ np.diag(np.array([_TILT_RAD, _TILT_RAD, _FREE_RAD]) ** -2.0) @ R_up_lidar
+    of_rotation = R_up_lidar.T @ np.diag(np.array([MOUNTED_RAD, MOUNTED_RAD, _FREE_RAD]) ** -2.0) @ R_up_lidar
     information[d:, d:] = of_rotation if d == 3 else _FREE_RAD**-2.0
     graph.add_factor(Prior(), 0, information, graph.poses[0])
     at = lie.transform(lie.inverse(T_enu_world), sighted.enu_m)
@@ -360,8 +360,8 @@ def _fitted(sighted: _Sighted, T_enu_world: Pose, up: Vector, *, estimates_anten
         tilt = T_enu_world[:3, :3] @ up
         H = np.einsum("nia,nij,njb->ab", J, information, J)
         b = np.einsum("nia,nij,nj->a", J, information, errors)
-        H[[3, 4], [3, 4]] += _TILT_RAD**-2.0
-        b[3:5] += np.array([tilt[1], -tilt[0]]) * _TILT_RAD**-2.0
+        H[[3, 4], [3, 4]] += MOUNTED_RAD**-2.0
+        b[3:5] += np.array([tilt[1], -tilt[0]]) * MOUNTED_RAD**-2.0
         H[[6, 7, 8], [6, 7, 8]] += _ANTENNA_M**-2.0 if estimates_antenna else _FIXED
         b[6:] -= sighted.antenna_m * _ANTENNA_M**-2.0 if estimates_antenna else 0.0
         step = np.linalg.solve(H, b)

@@ -16,6 +16,7 @@ from scanchain.graph.factors import Prior
 from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
 
+MOUNTED_RAD = 0.05  # σ of the vertical by the mounting of the lidar
 _CORRELATED_S = 1.0  # time constant of the errors
 _HELD = (1e-4, 1e-5)  # m and rad, σ of the first pose, whose position and heading gravity and ground leave free
 

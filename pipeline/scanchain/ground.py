@@ -14,13 +14,11 @@ from scanchain.evaluation.consistency import with_map_errors
 from scanchain.graph.consistency import is_bent
 from scanchain.graph.factors import Prior
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.gravity import hold_first, upright
+from scanchain.gravity import MOUNTED_RAD, hold_first, upright
 
 _UNEVEN = (0.02, 0.01)  # m and rad, largest σ of height and tilt in a plane, by the ground and the suspension
 _CORRELATED = 4  # number of successive keyframes that share such an error
-_MOUNTED_RAD = 0.05  # σ of the mounting of the lidar
 _PART_M = 50.0  # least length of the parts of the path that are tested, of which a plane has at least two
-_MARGIN_M = 25.0  # at those ends of a plane that are not ends of the path, which may lie on a ramp
 _DRIFT = 0.001  # largest drift of the height, as a share of the path; more is a hill unless ``on``
 _LEAST_SHARE = 0.5  # of the path in planes: parts of a rolling ground are flat by chance
 
@@ -48,7 +46,8 @@ def flattened(
     if share < _LEAST_SHARE:
         return graph, ""
     ends_m = [at_m[[each.first, each.last - 1]] for each in planes]
-    margins_m = [_MARGIN_M * np.array([each.first > 0, each.last < len(graph)]) for each in planes]
+    # half a part at those ends of a plane that are not ends of the path, which may lie on a ramp
+    margins_m = [0.5 * _PART_M * np.array([each.first > 0, each.last < len(graph)]) for each in planes]
     inside = [
         np.flatnonzero((at_m >= a + before) & (at_m <= b - after))
         for (a, b), (before, after) in zip(ends_m, margins_m, strict=True)
@@ -131,7 +130,7 @@ def _fitted(poses: Matrix, up: Vector) -> tuple[Pose, Vector]:
     T, mean = np.eye(4), (poses[:, :3, :3] @ up).mean(axis=0)
     T[:3, 3], R = poses[:, :3, 3].mean(axis=0), upright(mean / np.linalg.norm(mean))
     away = (poses[:, :3, 3] - T[:3, 3]) @ R.T
-    H = away[:, :2].T @ away[:, :2] + np.eye(2) * (_UNEVEN[0] / _MOUNTED_RAD) ** 2
+    H = away[:, :2].T @ away[:, :2] + np.eye(2) * (_UNEVEN[0] / MOUNTED_RAD) ** 2
     normal = R.T @ np.append(-np.linalg.solve(H, away[:, :2].T @ away[:, 2]), 1.0)
     T[:3, :3] = upright(normal / np.linalg.norm(normal)).T
     up = np.einsum("nji,j->i", poses[:, :3, :3], T[:3, 2])

@@ -23,7 +23,7 @@ from scanchain.kernels import scans as kernels
 from scanchain.range_noise import RangeNoise
 
 _SLOTS = (1 << 10, 1 << 22)  # least and most of a table for downsampling that is kept
-_RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
+RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
 _DENSE = (60_000, 40_000)  # returns at which scans become dense, and at which they remain so
 _FINE = math.sqrt(0.5)  # factor on the voxels of the map of dense scans, whose points fill finer ones
 _HYSTERESIS = 0.75  # distance to the target scale, in powers of two, above which the scale changes
@@ -198,7 +198,7 @@ class Resolution:
     """Voxel sizes chosen scan by scan.
 
     octave : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
-        that the median range spans about _RANGE_VOXELS voxels of the local map, or more
+        that the median range spans about RANGE_VOXELS voxels of the local map, or more
     scale : of the local map's voxels: ``octave``, times √½ for dense scans, whose number of points stays the same
     match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain
     noise : of the ranges, measured on the first scans
@@ -232,7 +232,7 @@ class Resolution:
         """Adapt the sizes to the points to match and the number of returns; True if they were right already."""
         before = self.scale, self.match_voxel_m
         median_range_m = float(np.median(np.linalg.norm(points, axis=1)))
-        target = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
+        target = math.log2(median_range_m / (RANGE_VOXELS * self.voxel_size_m))
         if abs(target - math.log2(self.octave)) > _HYSTERESIS:
             self.octave = min(max(2.0 ** round(target), self.config.min_scale), 1.0)
         self.is_dense = returns >= _DENSE[self.is_dense]

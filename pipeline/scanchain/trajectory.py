@@ -14,7 +14,6 @@ from scanchain.checks import RIGID
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError, counted, remedy_of
 
-_NS_PER_S = 1_000_000_000  # nanoseconds, as whole numbers: stamps are exact
 _TUM_ROW, _KITTI_ROW = 7 * " %.9f", " ".join(12 * ["%.9e"]) + "\n"
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
@@ -95,8 +94,8 @@ def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
 
 def format_stamp(stamp_ns: int) -> str:
     """Seconds with nine digits after the point, exact."""
-    sign = "-" if stamp_ns < 0 else ""
-    return f"{sign}{abs(stamp_ns) // _NS_PER_S}.{abs(stamp_ns) % _NS_PER_S:09d}"
+    seconds, rest_ns = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{rest_ns:09d}"
 
 
 def parse_stamp_ns(text: str, place: str) -> int:
@@ -107,7 +106,7 @@ def parse_stamp_ns(text: str, place: str) -> int:
         raise InputError(
             f"{place} has the stamp {text!r}; it must be a number of seconds (begin a line of column names with #)"
         ) from None
-    if not seconds.is_finite() or not -(2**63) <= seconds * _NS_PER_S < 2**63:
+    if not seconds.is_finite() or not -(2**63) <= seconds * 10**9 < 2**63:
         raise InputError(
             f"{place} has the stamp {text} s, which does not fit 64 bits of nanoseconds; give it in seconds"
         )

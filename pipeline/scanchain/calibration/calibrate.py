@@ -24,7 +24,8 @@ from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.mounting import angles_rad
 from scanchain.logs.stream import decoded_messages
 from scanchain.odometry import Odometry, Tracked
-from scanchain.odometry.delay import LONGEST_S, WheelDelay
+from scanchain.odometry.delay import BLOCK, LONGEST_S, WheelDelay
+from scanchain.odometry.distortion import WINDOWS_AT
 from scanchain.odometry.elevation import POINTS, cell_of
 from scanchain.preprocess import first_per_voxel
 from scanchain.registration import VoxelMap, create_matcher
@@ -42,7 +43,6 @@ _DEG = 180.0 / math.pi
 _UNITS = {"deg": (0.3, _DEG), "m": (0.05, 1.0), "": (0.01, 1.0), "s": (0.02, 1.0), "deg/s": (0.1, _DEG)}
 # largest σ of an observable parameter by its unit, and factor from SI
 _ANGLES = ("roll", "pitch", "yaw")
-_AT, _WINDOW = (0.5, 0.25, 0.75, 0.0, 1.0), 300  # windows in which the delay of wheels is found, and their scans
 _WITHOUT_WHEELS = (Override("odometry.prior", "constant-velocity", "doctor"),)
 
 
@@ -140,7 +140,7 @@ def delay_of_wheels(log: Log) -> float:
     if not log.odometry_topic:
         return 0.0
     config, found = load_settings(log.dimension, overrides=_WITHOUT_WHEELS).config, WheelDelay()
-    for window in log.windows(_AT, min(_WINDOW, log.scan_count)):
+    for window in log.windows(WINDOWS_AT[:5], min(BLOCK, log.scan_count)):
         odometry = Odometry(config, log.stated_mounting, dimension=log.dimension)
         for scan in window:
             odometry.process(scan)

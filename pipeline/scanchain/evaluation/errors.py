@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory, brief
 from scanchain.errors import InputError, counted
-from scanchain.evaluation.pairing import Pairs, nearest, pair
+from scanchain.evaluation.pairing import ERRORS_S, Pairs, nearest, pair
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 from scanchain.trajectory import posed, table
 
@@ -23,12 +23,11 @@ Floats = NDArray[np.float64]
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)  # of the benchmark
 SHORT_LENGTHS_M = (10.0, 20.0, 40.0)  # of segments of paths that are too short for these
-RELATION_LIMIT_S = 1e-3  # between a stamp of a relation and that of its pose; either may be in milliseconds
+RELATION_LIMIT_S = 2.0 * ERRORS_S[1]  # between a stamp of a relation and that of its pose
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 _FAR_OFF = (0.02, 0.1)  # ATE above both of which odometry failed: share of the path, meters
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
 _LARGEST = 2.0  # largest length of a segment over the requested one
-_LONG_PATH_M = 200.0  # shortest path on which the published lengths allow several starts
 _FIELDS = "stamp1 stamp2 x y z roll pitch yaw"
 
 
@@ -399,7 +398,7 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
 
 def kitti_error_of_any_path(pairs: Pairs) -> KittiError:
     """The published lengths where the path is long enough for them, else 10, 20 and 40 m from every pose."""
-    if path_length(pairs.reference)[-1] >= _LONG_PATH_M:
+    if path_length(pairs.reference)[-1] >= KITTI_LENGTHS_M[1]:  # which allows several starts of the first one
         return kitti_error(pairs)
     return kitti_error(pairs, SHORT_LENGTHS_M, every=1)
 

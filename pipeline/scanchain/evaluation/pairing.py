@@ -16,7 +16,7 @@ from scanchain.trajectory import read_kitti, read_tum, text_lines
 # least and most of the default widest gap: at 1 m/s² a straight line is up to 1.3 mm and up to 5 cm off within it
 _GAPS_S = (0.1, 0.6)
 _INTERVALS = 5.0  # median intervals of the reference that the default widest gap has at least
-_ERRORS_S = (1e-6, 5e-4)  # largest of a stamp that was a floating-point number of seconds, or in milliseconds
+ERRORS_S = (1e-6, 5e-4)  # largest of a stamp that was a floating-point number of seconds, or in milliseconds
 _FEW = 10  # number of poses below which their error has little meaning
 _FEWEST_AFTER_START = 4  # pairs with the first pose, of which three remain: as many as a rigid alignment takes
 _ROUNDING_SHARE = 0.1  # share of the reference's median interval that either error is at most
@@ -142,7 +142,7 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     early, late = after == 0, after == len(stamps_ns)
     before, after = np.maximum(after - 1, 0), np.minimum(after, len(stamps_ns) - 1)
     interval = stamps_ns[after] - stamps_ns[before]
-    same_ns, rounded_ns = (min(each * 1e9, _ROUNDING_SHARE * (interval_ns or np.inf)) for each in _ERRORS_S)
+    same_ns, rounded_ns = (min(each * 1e9, _ROUNDING_SHARE * (interval_ns or np.inf)) for each in ERRORS_S)
     between = ~early & ~late & (difference_ns > same_ns) & (interval <= gap_ns)
     known = between | (difference_ns <= rounded_ns)
     poses = reference.poses[index]

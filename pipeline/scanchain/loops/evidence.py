@@ -26,7 +26,7 @@ _TRACKED_M = 50.0  # path since the last match beyond which keyframes do not cou
 LARGEST_RATIO = 2.0  # largest log-likelihood ratio of one keyframe
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
 _OF_FIND = {2: 4.0, 3: 5.0}  # log-odds of a search result: finds most correct poses, wrong ones in 0.4 %, 0.1 %
-_SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are searched for together, at full scale
+SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are searched for together, at full scale
 _NO_OVERLAP = 0.3  # overlap above which a match is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of points in view of the other keyframe for which the comparison counts in full
 _LATEST = 10  # number of last counted keyframes on which the next one may depend
@@ -123,7 +123,7 @@ class SequentialPlaceTest:
                 return ()
             newest, start = keyframes[-1], keyframes[self.segments.starts[-1]]
             d = newest.T_odom_lidar.shape[0] - 1
-            searches = (newest.traveled_m - start.traveled_m) / (_SEARCHED_M[d] * newest.scale)
+            searches = (newest.traveled_m - start.traveled_m) / (SEARCHED_M[d] * newest.scale)
             self.searches = max(searches, self.searches)
             self.log_odds, self.matches, self.counted_m = _OF_FIND[d], 0.0, []
         for each in _best_of_each(closures):

@@ -15,7 +15,7 @@ from scanchain.checks import LARGEST
 from scanchain.config import MapsConfig
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.kernels.search import Score
-from scanchain.loops.evidence import rank_of
+from scanchain.loops.evidence import SEARCHED_M, rank_of
 from scanchain.loops.place_search import Underway, candidates, completed
 from scanchain.loops.submaps import VoxelSubmaps, seen_together
 from scanchain.loops.verification import Verifier
@@ -37,7 +37,6 @@ _APART_RAD = 0.2  # least angle of two distinct poses
 _CHANCE = 2.0  # over the root of the number of points: share above the least that is reached by chance
 _CERTAINLY = 0.06  # least share above these for a location to count as found
 _CLEAR_M = 2.0  # least path since an ambiguous search for a location to count as found
-PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 
 # of the scans of a path that was found
 AGREE = (0.5, 0.1)  # m and rad, largest distance of an aligned scan from where its path was found
@@ -222,6 +221,6 @@ def _are_apart(T: Pose, T_other: Pose) -> bool:
 def _path_begin(keyframes: Sequence[Keyframe], start: int) -> int:
     """The first keyframe, from ``start`` on, of the path whose points are searched for."""
     first = len(keyframes) - 1
-    while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= PATH_M:
+    while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= SEARCHED_M[2]:
         first -= 1
     return first

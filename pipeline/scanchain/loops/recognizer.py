@@ -14,7 +14,7 @@ from scanchain.config import Config
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Problem, Proposal
 from scanchain.errors import InputError, shown
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, VoxelSubmaps, submap_around
+from scanchain.loops.submaps import RADII_BEHIND, Submap, VoxelSubmaps, submap_around
 from scanchain.loops.verification import Verification, Verifier
 
 RECOGNIZERS = {"outline": "scanchain.loops.upright_search:OutlineRecognizer"}
@@ -127,7 +127,7 @@ class PlaceCloser:
                 self.added.append(anchor.index)
         self.examined = len(keyframes)
         last, limits = keyframes[-1], self.config.loops
-        apart_m = max((RADII_BEHIND + RADII_AHEAD) * self._radius_m(last), limits.min_travel_m)
+        apart_m = max((RADII_BEHIND + 1.0) * self._radius_m(last), limits.min_travel_m)
         self.next_m = last.traveled_m + 2.0 * apart_m
         return self.next_m
 
@@ -170,7 +170,7 @@ class PlaceCloser:
         while self.examined < len(keyframes):
             keyframe = keyframes[self.examined]
             radius_m = self._radius_m(keyframe)
-            if keyframes[-1].traveled_m < keyframe.traveled_m + RADII_AHEAD * radius_m and not finish:
+            if keyframes[-1].traveled_m < keyframe.traveled_m + radius_m and not finish:
                 return
             self.examined += 1
             if keyframe.traveled_m >= self.next_m:
@@ -189,7 +189,7 @@ class PlaceCloser:
         submap, T_world = self._submap(anchor, keyframes), graph.poses
         recognizer.add(submap)
         self.added.append(anchor.index)
-        apart_m = max((RADII_BEHIND + RADII_AHEAD) * submap.radius_m, self.config.loops.min_travel_m)
+        apart_m = max((RADII_BEHIND + 1.0) * submap.radius_m, self.config.loops.min_travel_m)
         T_expected = self._expected(anchor, keyframes, T_world)
         query = Query(submap, anchor.traveled_m - apart_m, T_expected, keyframes, T_world)
         candidates = recognizer.query(query)

@@ -18,8 +18,7 @@ from scanchain.kernels.voxels import PLANE, Cell
 from scanchain.loops.connectivity import Segments
 from scanchain.registration import VoxelMap
 
-RADII_AHEAD = 1.0  # radii of the trajectory after the anchor that a submap takes in
-RADII_BEHIND = 2.0  # radii of the trajectory before it: a lidar that looks ahead sees a location from far off
+RADII_BEHIND = 2.0  # radii of the trajectory before its anchor that a submap takes in: a lidar looks ahead
 _MAX_POINTS = 80_000  # largest number of points of a submap, from keyframes evenly spread over it
 _OF_MAP = 2  # factor on the number of keyframes in a submap of a map, which was seen from several sides
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
@@ -61,7 +60,7 @@ def submap_around(keyframes: Sequence[Keyframe], anchor: int, radius_m: float, s
     here_m = keyframes[anchor].traveled_m
     begin, end = segments.span(anchor, len(keyframes))
     first = bisect_left(keyframes, here_m - RADII_BEHIND * radius_m, begin, end, key=_traveled_m)
-    last = bisect_left(keyframes, here_m + RADII_AHEAD * radius_m, begin, end, key=_traveled_m)
+    last = bisect_left(keyframes, here_m + radius_m, begin, end, key=_traveled_m)
     return Submap(keyframes[anchor], keyframes[first:last], radius_m)
 
 

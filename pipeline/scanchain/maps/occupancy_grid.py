@@ -14,7 +14,7 @@ from scanchain.errors import InputError
 from scanchain.kernels import maps as kernels
 
 OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
-FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown
+FREE_PROBABILITY = 1.0 - OCCUPIED_PROBABILITY  # below it as free; between them, and where unseen, as unknown
 MAX_CELLS = 64_000_000  # largest number of cells: half a gigabyte
 
 # log-odds of a hit (0.7) and a miss (0.4), and their limits (0.12 and 0.97): Hornung et al. 2013, sec. 5.1

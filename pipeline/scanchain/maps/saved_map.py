@@ -38,7 +38,7 @@ _ROW = np.dtype([
 ])  # fmt: skip
 _WHOLE = ("session", "count", "stamps_ns", "scan_index", "pairs")  # arrays of whole numbers
 _MOST_STEP_M = 1e6  # largest step in a map whose points are not damaged
-_WIDE_FROM_M = 0.01  # step above which they take 32 bits: one far return must not make all points coarse
+COARSE_M = 0.01  # step of coordinates, above which rounding adds to a sensor noise of 3 cm
 
 
 class Session(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -152,7 +152,7 @@ def write_saved_map(saved: SavedMap) -> None:
         for place, each in enumerate(keyframes):
             points = each.points
             reach_m = float(np.abs(points).max(initial=0.0))
-            is_wide = reach_m > _WIDE_FROM_M * np.iinfo(_NUMBER).max
+            is_wide = reach_m > COARSE_M * np.iinfo(_NUMBER).max  # one far return must not make all points coarse
             number = _WIDE if is_wide else _NUMBER
             step_m = max(reach_m / np.iinfo(number).max, STEP_M)
             file.write(np.rint(points / step_m).astype(number).tobytes())

@@ -9,6 +9,7 @@ import numpy as np
 
 from scanchain.data import GRAVITY_M_S2, LEAST_FIT, Match, Matrix, Pose, RestForce, Vector, unit_of
 from scanchain.odometry.gyro import Gyro
+from scanchain.odometry.motion_filter import CAUTION
 
 _MOTIONS = (15, 20)  # least and most whose errors decide whether the accelerometer is used
 _RATIO = (0.9, 1.5)  # of its squared errors to those of the last motion, below which it comes, and stays, in use
@@ -26,7 +27,6 @@ _GAIN, _OUTLIER = 0.1, 9.0  # of these factors, and squared innovation in σ² t
 _LEAST = 1e-6  # information along each direction: 1 km
 _LEAK = 1e-3  # share of the information that an open direction seems to have if it is off by 2°
 _CONTRADICTED = 0.04  # factor on the information of a match that its correspondences contradict
-_CAUTION = 4.0  # factor on the predicted variance
 _LEAST_GROWTH_M2 = 1e-8  # of the variance of the position from scan to scan
 _P, _V, _G, _B = (slice(at, at + 3) for at in (0, 3, 6, 9))  # position, velocity, gravity, bias in the state
 
@@ -105,13 +105,13 @@ class Accelerometer:
         self.P = F @ self.P @ F.T + self._noise(lasted_s, forces)
         R_now = self.R_odom_lidar = R_odom @ R_last[-1]
         self.position = self.x[_P] - R_now @ self.p_lidar_imu
-        self.covariance = _CAUTION * R_now.T @ self.P[_P, _P] @ R_now
+        self.covariance = CAUTION**2 * R_now.T @ self.P[_P, _P] @ R_now
         self.growth = R_now.T @ (self.P[_P, _P] - before) @ R_now
 
     @property
     def gained(self) -> Matrix:
         """Covariance (3, 3) by which that of the position grew since the last scan, in the lidar's frame."""
-        growth, axes = np.linalg.eigh(_CAUTION * self.growth)
+        growth, axes = np.linalg.eigh(CAUTION**2 * self.growth)
         return (axes * np.maximum(growth, _LEAST_GROWTH_M2)) @ axes.T
 
     def correct(self, T_odom_lidar: Pose, match: Match | None, continued: Vector) -> None:

@@ -11,7 +11,7 @@ from scanchain.data import Mask, Matrix, Pose, Vector
 _DELAYS_S = np.linspace(-1.0, 1.0, 101)  # of the wheels' stamps against those of the scans
 MOST_DELAY_S = float(_DELAYS_S[-1])
 APART_S, _ODDS = 0.1, 10.0  # distinct delays, and least log-likelihood ratio against any other
-_BLOCK, FEWEST = 300, 30  # scans that are compared together; least number of motions
+BLOCK, FEWEST = 300, 30  # scans that are compared together; least number of motions
 LONGEST_S = 0.5  # time between two scans whose motion is compared
 
 
@@ -94,7 +94,7 @@ class WheelDelay:
         """Add the poses of a scan by scans and wheels; ``is_known`` if the former is determined."""
         if self.is_clear:
             return
-        if len(self.block) == _BLOCK or (self.block and abs(1e-9 * stamp_ns - self.block[-1][0]) > MOST_DELAY_S):
+        if len(self.block) == BLOCK or (self.block and abs(1e-9 * stamp_ns - self.block[-1][0]) > MOST_DELAY_S):
             self._set(self.total)
         self.block.append((1e-9 * stamp_ns, T_odom_lidar, T_odom_base, is_known))
 

@@ -20,7 +20,7 @@ from scanchain.logs.messages.point_times import from_azimuth
 from scanchain.odometry.odometry import Odometry
 from scanchain.settings import load_settings
 
-_AT = (0.5, 0.25, 0.75, 0.0, 1.0, 0.375, 0.625)  # positions of windows in the log, in the order tried
+WINDOWS_AT = (0.5, 0.25, 0.75, 0.0, 1.0, 0.375, 0.625)  # positions of windows in the log, in the order tried
 _ENOUGH, _MOST, _SCANS = 3, 5, 16  # windows with motion: enough if significant, at most; scans each
 _BEGIN, _BLOCK = 4, 3  # first scans of a window, skipped while its map is small; scans per residual block
 _POINTS = 8_000  # points per scan, sampled at random
@@ -120,7 +120,7 @@ def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
     preprocess = msgspec.structs.replace(config.preprocess, match_points=500, calibrate_elevation=False)
     config = msgspec.structs.replace(config, preprocess=preprocess)
     found, residuals, timing, is_spinning = None, list[NDArray[np.float64]](), log.config, False
-    for window in log.windows(_AT, _SCANS):
+    for window in log.windows(WINDOWS_AT, _SCANS):
         is_given = len(window[0].times_s) > 0
         if is_given and not of_given:
             return None
@@ -189,7 +189,7 @@ def _adopt_point_times(log: Log, wanted: str) -> None:
 
 def _sweep_share(log: Log, *, deskew: bool = True) -> float:
     """Scan duration over scan period; 0 where point times deskew the scans."""
-    for window in log.windows(_AT[:1], _SCANS):
+    for window in log.windows(WINDOWS_AT[:1], _SCANS):
         if not (deskew and len(window[0].times_s)):
             period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window])))
             return min(_by_azimuth(window, log.config)[0].revolution_s / max(period_s, 1e-9), 1.0)

@@ -13,11 +13,11 @@ from scanchain import lie
 from scanchain.data import Matrix, Points, Pose, Vector
 from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
 from scanchain.kernels.scans import raise_elevation
-from scanchain.preprocess import Sweep
+from scanchain.preprocess import RANGE_VOXELS, Sweep
 from scanchain.registration.search import evenly
 
 _WINDOWS = ((14, 0.6), (16, 0.9))  # scans adjusted together, and their spacing in cells: the first time, later
-_RANGE_M, _SMALLEST_M = 14.0, 0.125  # median range at which cells are 1 m, and smallest cell
+_SMALLEST_M = 0.125  # smallest cell
 POINTS = 3500  # largest number of points of each scan, evenly spread
 _STEPS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps; offset and turns of a converged one
 _RIDGE = 1e-6  # regularizes directions that no plane constrains
@@ -144,7 +144,7 @@ def cell_of(points: Points) -> float:
     points : (N, 3) of a scan
     """
     range_m = float(np.median(np.linalg.norm(points, axis=1)))
-    return min(max(2.0 ** round(math.log2(range_m / _RANGE_M)), _SMALLEST_M), 1.0)
+    return min(max(2.0 ** round(math.log2(range_m / RANGE_VOXELS)), _SMALLEST_M), 1.0)
 
 
 def kernel_scale(residual: Vector) -> float:

@@ -25,10 +25,9 @@ _RANGE_VOXELS = {2: 40.0, 3: 14.0}  # largest number of voxels that the median d
 _WINDOW = (0.5, 1.0)  # half the window searched in the plane: share of that distance, and rad
 _SEEDS = Wanted(apart_m=1.0, rival=0.6, answers=6)  # initial poses in the plane
 _SEEN_FROM = 3.0  # largest distance of a sensor, in the origin, from the centroid, in such median distances
-_ELSEWHERE = (0.1, 0.05)  # m and rad, distance above which two matches are distinct
+_ELSEWHERE = (0.1, 0.05)  # m, in space voxels, and rad: distance above which two matches are distinct
 AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
 _MOST = 3  # times the number of points to match, above which more points only cost time
-_SAME = 0.1  # voxels; largest distance of equal poses found at two voxel sizes
 _GAIN = 12.5  # least decrease of cost, in variances of a range, to leave the guess along a weak direction: 5 σ
 _APART = 10.0  # times that distance between the centroids, above which the clouds cannot overlap
 
@@ -114,7 +113,7 @@ def _at_another_scale(
         coarser = matched(2.0 * size_m, match.T_target_source)
         if coarser.converged:  # found at one scale, confirmed at the other
             again = matched(size_m, coarser.T_target_source)
-            same = again.T_target_source, coarser.T_target_source, _SAME * size_m, _ELSEWHERE[1]
+            same = again.T_target_source, coarser.T_target_source, _ELSEWHERE[0] * size_m, _ELSEWHERE[1]
             if again.converged or lie.agree(*same):
                 match = again if again.converged else coarser
     return match

@@ -22,6 +22,7 @@ from scanchain.logs.formats.clouds import SUFFIXES, CloudFileError, read_cloud_f
 from scanchain.maps import MAP_FOLDER, Edges, SavedMap, SavedPoints, Session, write_saved_map
 from scanchain.maps.files import read_las
 from scanchain.maps.occupancy_grid import MAX_CELLS
+from scanchain.maps.saved_map import COARSE_M
 from scanchain.preprocess import Resolution
 from scanchain.runs.directory import RunDirectory
 from scanchain.settings import load_settings
@@ -36,7 +37,6 @@ _HIDDEN_M = 0.5  # distance behind the nearest point of its bin beyond which a p
 _LEAST_POINTS = 100  # least number of points in view of a position
 _MAX_POSITIONS, _MAX_CELLS = 20_000, 2_000_000  # largest numbers of positions, and of those that are tried
 _PERCENTILE, _OUTLIER = 99.0, 10.0  # of distances from the median; multiple of it beyond which points are outliers
-_COARSE_STEP_M = 0.01  # of coordinates, above which rounding adds to a sensor noise of 3 cm
 _MODES = ("trinary", "scale", "raw")  # of map_server
 
 
@@ -135,7 +135,7 @@ def _read(file: Path, spacing_m: float | None) -> _Surfaces:
             f"finite, or more than {_OUTLIER:g} times as far out as {_PERCENTILE:g} % of the points"
         )
     step_m = max(map(_step_m, columns, points.T), default=0.0)
-    if step_m > _COARSE_STEP_M:
+    if step_m > COARSE_M:
         notes.append(
             f"{file}: its coordinates reach {np.abs(points).max():,.0f} m and come in steps of {step_m:g} m "
             "there: the map and all poses in it are no more accurate; subtract an offset before they are stored, "

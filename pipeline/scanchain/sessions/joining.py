@@ -18,8 +18,8 @@ from scanchain.data import DOWNWEIGHTED, Closure, Keyframe, Matrix, Pose
 from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import SequentialPlaceTest, compared
-from scanchain.loops.planar_map_search import AGREE, PATH_M, PlanarMapSearch
+from scanchain.loops.evidence import SEARCHED_M, SequentialPlaceTest, compared
+from scanchain.loops.planar_map_search import AGREE, PlanarMapSearch
 from scanchain.loops.upright_search import MEMBERS, UprightMap
 from scanchain.maps import Edges, SavedMap
 from scanchain.placement import loop_information
@@ -302,7 +302,7 @@ def repeated_paths(
     """
     searches = [PlanarMapSearch(part, config.local_map.voxel_size_m) for part in (host, guest)]
     traveled_m = np.array([keyframe.traveled_m for keyframe in guest]) - guest[0].traveled_m
-    length_m = max(min(PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
+    length_m = max(min(SEARCHED_M[2], 0.5 * traveled_m[-1]), _STEP_M)
     step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
     begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
     ends = np.unique(np.searchsorted(traveled_m, [begin_m, begin_m + length_m]), axis=1).T.tolist()

@@ -15,7 +15,7 @@ from scanchain.verdict.evidence import Check, Evidence, Floats, Kind, Segment, l
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
 _MOST_PREDICTED = 0.5  # largest share of scans with a predicted pose that nothing confirms
-_MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
+MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
 _FEW_POINTS = 100  # number of points below which a scan is sparse; scans of planar lidars have more
 # largest harmless extent of a segment of predicted or contradicted poses; of one that another sensor confirms
 _PASSED_M = (1.0, 4.0)
@@ -25,8 +25,8 @@ _LEAST_OVERLAP = 2.0 / 3.0  # smallest accepted ratio of the inlier share to the
 _PREVIOUS = (3, 10)  # least and largest number of previous scans whose median is the usual share
 
 _ACCELERATION = (4.0, 12.0)  # m/s² and rad/s², σ: a fifth to a third of what vehicles and hands reach
+JUMP_M = 1.0  # change of the motion from scan to scan that no vehicle makes
 _MOTION = (0.05, 0.01)  # m and rad, σ of the motion between two scans by scan matching
-_LARGE_M = 1.0  # jump above which the trajectory is wrong
 
 _RESTING_M = 0.05  # largest distance from copies to the next scan at which the lidar was at rest
 
@@ -55,7 +55,7 @@ class States(Check):
     def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Many degenerate scans."""
         count = int(evidence.is_degenerate.sum())
-        if count > _MOST_OPEN * len(evidence):
+        if count > MOST_OPEN * len(evidence):
             yield (
                 f"{count:,} of {len(evidence):,} scans are degenerate: in at least one direction poses are those "
                 "of the prediction, by wheels where these are used"
@@ -165,7 +165,7 @@ class Velocity(Check):
 
     def failures(self, evidence: Evidence, segments: Sequence[Segment]) -> Iterator[str]:
         """The large jumps."""
-        jumps = [each for each in segments if each.kind == self.kind and (each.size_m or 0.0) > _LARGE_M]
+        jumps = [each for each in segments if each.kind == self.kind and (each.size_m or 0.0) > JUMP_M]
         if jumps:
             yield listed(jumps)
 

@@ -16,6 +16,7 @@ from scanchain.registration import hand_eye
 from scanchain.registration.hand_eye import HandEye
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 from scanchain.verdict.evidence import KNOWN, Check, Closures, Evidence, Floats, Kind, Segment, extent_m, merged
+from scanchain.verdict.scans import JUMP_M
 
 WINDOW_M = 4.0  # path over which wheels and trajectory are compared
 _SHORTEST_M = 0.5  # shortest path of a window that is checked
@@ -37,7 +38,6 @@ _RATIO = 1.0 / 3.0  # largest ratio of the residual with the right source to tha
 # least share of a disagreement that the wrong source leaves, that a jump of the wheels explains, or, of one with
 # loop closures, that the wheels confirm
 _EXPLAINED = 0.5
-_IMPOSSIBLE_M = 1.0  # smallest change of the wheels' motion from scan to scan that is a jump
 
 
 class Wheels(Check):
@@ -276,7 +276,7 @@ def which_slipped(
         size_m = float(np.linalg.norm(apart[place]))
         changes = (np.diff(poses[first : last + 1, :-1, -1], n=2, axis=0) for poses in (wheels, odometry))
         jump_m, usual_m = (np.nan_to_num(np.linalg.norm(each, axis=1)).max(initial=0.0) for each in changes)
-        if jump_m > max(_IMPOSSIBLE_M + 2.0 * usual_m, _EXPLAINED * size_m):
+        if jump_m > max(JUMP_M + 2.0 * usual_m, _EXPLAINED * size_m):
             found.append((Kind.WHEELS_SLIP, size_m))
             continue
         around = np.flatnonzero(closures.is_accepted & (low <= first) & (high >= last))

@@ -15,7 +15,7 @@ from scanchain.batch.task import Row, State, output_file
 from scanchain.errors import counted
 from scanchain.files import source_of, without_keys
 from scanchain.trajectory import read_tum
-from scanchain.verdict import MOST_CONTRADICTED
+from scanchain.verdict import MOST_CONTRADICTED, MOST_OPEN
 from scanchain_viz.colors import color_of
 from scanchain_viz.pictures.axis import MARGIN
 from scanchain_viz.pictures.figure import Plot
@@ -88,7 +88,7 @@ def _cells(row: Row) -> Sequence[page.Cell | str]:
         page.verdict_cell(m.verdict),
         f"{m.scans:,}",
         page.bad_if(m.contradicted > MOST_CONTRADICTED * m.scans, f"{m.contradicted:,}"),
-        page.bad_if(m.degenerate > 0.5 * m.scans, f"{m.degenerate:,}"),
+        page.bad_if(m.degenerate > MOST_OPEN * m.scans, f"{m.degenerate:,}"),
         page.bad_if(m.lost > 0.01 * m.scans, f"{m.lost:,}"),
         page.bad_if(row.warnings > 0, f"{row.warnings:,}"),
         f"{m.traveled_m:,.1f}",
