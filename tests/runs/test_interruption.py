@@ -82,11 +82,19 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
     out, stamps_ns = tmp_path / "run", read_tum(whole / "odometry.tum").stamps_ns
     assert pq.read_table(whole / "loops.parquet").num_rows > 0
     reached = []
-    for interruption, share in ((signal.SIGKILL, 0.1), (signal.SIGINT, 0.2), (signal.SIGKILL, 0.3)):
-        child = killing.start(office, out, *RECORDED, "--resume")
-        killing.wait_for_steps(child, out, share * len(stamps_ns))
-        child.send_signal(interruption)
-        child.wait()
+    for interruption, share in ((signal.SIGKILL, 0.25), (signal.SIGINT, 0.4), (signal.SIGKILL, 0.5)):
+        interrupted = f"""
+from scanchain.runs.resume import Checkpoints
+act = Checkpoints.write
+def interrupted(self, slam, *more):
+    act(self, slam, *more)
+    if len(slam.steps) >= {share * len(stamps_ns)}:
+        Checkpoints.write = act
+        os.kill(os.getpid(), {int(interruption)})
+Checkpoints.write, Checkpoints.are_due = interrupted, lambda self: True
+"""
+        words = ["run", str(office), "--out", str(out), *RECORDED, "--resume"]
+        assert after(interrupted, *words).wait() != 0
         table = read_checkpoint(killing.partial(out), killing.config_of(killing.partial(out))).slam.steps
         reached.append(len(table))
         assert (killing.partial(out) / RECORDING_FILE).exists()
