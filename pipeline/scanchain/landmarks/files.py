@@ -209,13 +209,14 @@ def robots_of(folder: Path) -> tuple[int, ...]:
 
 def read_mrclams(folder: Path, robots: Sequence[int]) -> list[RangeLog]:
     """Logs of several robots with their observations of each other; raises InputError as ``read_mrclam`` does."""
-    logs = [read_mrclam(folder, robot, robots) for robot in robots]
+    logs, result = [read_mrclam(folder, robot, robots) for robot in robots], list[RangeLog]()
     for log in logs:
-        for k, other in enumerate(logs):
-            begin_s, *_, end_s = log.times_s
-            is_lost = (other.subjects == -log.robot) & ((other.seen_s < begin_s) | (other.seen_s > end_s))
-            logs[k] = replace(other.seen(~is_lost), outside=other.outside + int(is_lost.sum()))
-    return logs
+        is_lost = np.zeros(len(log.seen_s), np.bool_)
+        for other in logs:
+            is_out = (log.seen_s < other.times_s[0]) | (log.seen_s > other.times_s[-1])
+            is_lost |= (log.subjects == -other.robot) & is_out
+        result.append(replace(log.seen(~is_lost), outside=log.outside + int(is_lost.sum())))
+    return result
 
 
 def read_mrclam(folder: Path, robot: int, together: Sequence[int] = ()) -> RangeLog:

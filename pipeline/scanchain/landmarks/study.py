@@ -278,7 +278,8 @@ def study_log(folder: Path, options: Options) -> Study:
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     facts = _facts(logs, solution, is_stated=options.noise is not None) | left_out
     minimum, wrong = solution.minimum, tuple[int, ...]()
-    nodes_s = np.split(solution.nodes_s, solution.problem.measurements.starts[1:])
+    starts = solution.problem.measurements.starts
+    nodes_s, poses = (np.split(each, starts[1:]) for each in (solution.nodes_s, minimum.estimate.state.poses))
     states, landmarks = (solution.reckoned, minimum.estimate.state), system.pattern.layout.landmarks
     if options.ignore_barcodes:
         wrong = tuple(contradicted(logs[0], solution).tolist())
@@ -289,7 +290,6 @@ def study_log(folder: Path, options: Options) -> Study:
         facts["CONTRADICTED"] = f"{which} not seen on most visits: duplicates, or poses that are wrong"
     named = None if options.ignore_barcodes else landmarks
     (before, after), true_poses, surveyed = against_truth(states, nodes_s, named, logs)
-    poses = np.split(minimum.estimate.state.poses, solution.problem.measurements.starts[1:])
     name = logs[0].name if len(logs) == 1 else f"{folder.resolve().name} robots {', '.join(map(str, robots))}"
     return Study(
         name, facts, before, after, minimum.converged and not wrong, solution.covariance, true_poses,
@@ -327,8 +327,8 @@ def _facts(logs: Sequence[RangeLog], solution: RangeSolution, *, is_stated: bool
             f"noise: {of_wheels[k]}; {of_sensors[k]} (Student's t)"
             for k, log in enumerate(logs)
         }
-        met = f"of robots {of_sensors[-1]}; " if len(sensors) > len(logs) else ""
-        of_robots |= {"odometry noise": f"{state}: {fits[0]}", "sensor noise": f"estimated: {met}{fits[1]}"}
+        to_robots = f"of robots {of_sensors[-1]}; " if len(sensors) > len(logs) else ""
+        of_robots |= {"odometry noise": f"{state}: {fits[0]}", "sensor noise": f"estimated: {to_robots}{fits[1]}"}
     nodes, met = counted(len(solution.nodes_s), "pose"), sum(int((log.subjects < 0).sum()) for log in logs)
     of_others, unknown, outside = (
         sum(counts) for counts in zip(*((log.of_robots, log.unknown, log.outside) for log in logs), strict=True)

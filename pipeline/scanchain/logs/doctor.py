@@ -27,7 +27,9 @@ from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
 _GAP_PERIODS = 2.5  # longest time between scans, in periods, that is not a gap
+_LONG_GAP_S = (0.5, 10.0)  # longest gap over which the motion is predicted reliably, and with wheels
 _PARTS = (0.3, 1.2)  # scan duration over period outside which a time unit is implausible
+_FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
 _MANY_UNUSED = 0.3  # share of unused returns above which a wider range is recommended
 _LEAST_DRIFT, _CLEAR_DRIFT, _LEAST_SPAN_S = 2e-5, 3.0, 10.0  # rate above those of quartzes, drift over jitter, log
 _FEW_POINTS = 50  # number of returns below which matches are weak
@@ -194,7 +196,7 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     longest_s, at_s = steps_s[longest], seen.log_time_s(longest)
     found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, {at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
-    if longest_s < (10.0 if is_on_wheels else 0.5):
+    if longest_s < _LONG_GAP_S[is_on_wheels]:
         return Finding("gaps", Severity.NOTE, found, effect)
     effect += (
         "; after a long gap a match may converge to a wrong pose: run the part before, as below, and the rest, "
@@ -243,7 +245,7 @@ def _wheels(seen: Survey) -> Finding:
     missed = len(seen.scans) - len(seen.wheels)
     found = f"{log.wheels}: {missed} of {scans} without a reading within 0.5 s"
     without = "--odometry.prior constant-velocity"
-    if (speed_m_s := _wheel_speed_m_s(seen)) > 100.0:
+    if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
         effect = "no vehicle is as fast: millimeters, or jumps? Poses are predicted far from the robot"
         return Finding("wheels", Severity.PROBLEM, found, effect, without)

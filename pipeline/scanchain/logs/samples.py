@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,23 @@ NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and, with i
 HOLD_SCANS = 32  # largest number of scans that wait for samples, or for points of other lidars; limits memory
 
 
-S = TypeVar("S", StampedPose, ImuSample)
+class Sample(Protocol):
+    """Measurement of a sensor at a stamp."""
+
+    @property
+    def stamp_ns(self) -> int: ...  # noqa: D102
+
+
+class Interpolable(Sample, Protocol):
+    """Measurement that can be interpolated."""
+
+    def interpolate(self, later: Self, stamp_ns: int) -> Self:
+        """The sample at a stamp between this one and a later one."""
+        ...
+
+
+S = TypeVar("S", bound=Sample)
+V = TypeVar("V", bound=Interpolable)
 
 
 class SampleStream(Generic[S]):
@@ -54,7 +70,7 @@ class SampleStream(Generic[S]):
         begin, end = bisect_left(self._stamps_ns, begin_ns), bisect_right(self._stamps_ns, end_ns)
         return [self._samples[stamp_ns] for stamp_ns in self._stamps_ns[begin:end]]
 
-    def at(self: SampleStream[StampedPose], stamp_ns: int) -> StampedPose | None:
+    def at(self: SampleStream[V], stamp_ns: int) -> V | None:
         """The sample at a stamp, interpolated between its neighbors or the nearest; None beyond half a second."""
         if stamp_ns in self._samples:
             return self._samples[stamp_ns]

@@ -115,10 +115,8 @@ def draw_points(
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
     pixel = row * columns + column
-    opacity, most = (
-        float(np.clip(40_000 / len(points), 0.4, 1.0)),
-        6,
-    )  # of a point; points above which more count alike
+    opacity = float(np.clip(40_000 / len(points), 0.4, 1.0))  # of one point
+    most = 6  # points of a pixel that are told apart
     counts = np.minimum(np.bincount(pixel, minlength=rows * columns), most)
     shades, highest = palette_of(colors, 36 if len(colors) > 1 else 1), np.zeros(rows * columns, int)  # 256 in all
     if len(shades) > 1:

@@ -35,6 +35,8 @@ from scanchain.logs.index import (
 from scanchain.logs.writer import schema_text
 
 _BLOCK_BYTES = 4_000_000  # approximate size of a block in bytes of the file
+_MOST_BLOCKS = 8192  # largest number of blocks, as each one costs a query
+_MOST_DECOMPRESSED = 1 << 27  # largest decompressed size of the messages of a block in bytes
 _MODE = re.compile(r"^( *compression_mode:)[ \"']*(\w*).*$", re.MULTILINE)
 _COUNT = re.compile(r"^  message_count: *(\d{1,15})$", re.MULTILINE)
 
@@ -72,7 +74,7 @@ def index_ros2_bag(path: Path, number: int, _: LogConfig) -> FileIndex:
         index.damage.append(f"{path}: {counted(lost, 'message')} of a topic that it does not list")
     if index.channels:  # spans of equal length, each with a few megabytes on average
         size, length_ns = size_of(path), reader.end_time - bag.begin_ns
-        count = min(max(size // _BLOCK_BYTES, 1), 8192, max(length_ns, 1))  # each costs a query
+        count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
         edges_ns = [bag.begin_ns + length_ns * place // count for place in range(count + 1)]
         for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
             share = size // count
@@ -184,7 +186,7 @@ class _Bag:
                     self._rescue(one_line(error))
         if self.reader is not reader:
             return self.contents(index, block, wanted)
-        messages, left = list[Message](), 1 << 27  # bytes of messages, decompressed
+        messages, left = list[Message](), _MOST_DECOMPRESSED
         for channel, time_ns, data in found:
             message, defect = _decompressed(data, left) if self.is_packed else (data, "")
             left -= len(message)

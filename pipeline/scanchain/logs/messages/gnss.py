@@ -9,6 +9,8 @@ import numpy as np
 from scanchain.data import Matrix
 from scanchain.logs.messages.ros import MalformedMessageError, frame_of, stamp_ns
 
+_UNKNOWN_M = (5.0, 5.0, 10.0)  # standard deviations east, north and up where the receiver states none
+
 
 class Fix(NamedTuple):
     """Latitude and longitude in degrees, altitude above the ellipsoid in m; covariance (3, 3), east north up."""
@@ -35,5 +37,5 @@ def fix_of(message: Any, at_ns: int, frame: str) -> Fix:
     covariance = np.array(message.position_covariance, np.float64)
     is_stated = message.position_covariance_type > 0 and covariance.size == 9 and np.isfinite(covariance).all()
     if not is_stated or np.linalg.eigvalsh(covariance.reshape(3, 3))[0] <= 0.0:
-        covariance = np.diag([25.0, 25.0, 100.0])  # it states none
+        covariance = np.diag(np.square(_UNKNOWN_M))
     return Fix(at_ns, frame, position, covariance.reshape(3, 3))
