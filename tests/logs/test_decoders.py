@@ -6,6 +6,7 @@ import pytest
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
+from tests.support.messages import says
 from tests.support.naive_logs import (
     ROS,
     STAMP_NS,
@@ -52,6 +53,40 @@ def test_a_laser_scan_is_read_in_either_byte_order_and_sense(tmp_path, order, fr
     np.testing.assert_allclose(scan.points, laser_points(ranges, first, step), atol=2e-6)
     np.testing.assert_allclose(scan.times_s, 1e-4 * np.arange(50), rtol=1e-5)
     assert scan.stamp_ns == STAMP_NS and scan.points.dtype == scan.times_s.dtype == np.float32
+
+
+def test_an_increment_of_zero_follows_from_the_angles_of_both_ends_and_without_these_the_scan_is_malformed(
+    tmp_path,
+):
+    ranges = np.linspace(2.0, 3.0, 101)
+    told = [ROS.laser_scan(STAMP_NS, ranges.astype("f4"), first=-1.0, step=step) for step in (0.02, 0.02, 0.0)]
+    told[1].angle_increment = 0.0
+    usual, unset, degenerate = (ROS.serialize(each, "sensor_msgs/msg/LaserScan") for each in told)
+    log = open_log(write(tmp_path / "unset.mcap", [scan_said(STAMP_NS, unset)]))
+    (scan,) = log.scans()
+    np.testing.assert_allclose(scan.points, only_scan(tmp_path, scan_said(STAMP_NS, usual)).points, atol=1e-6)
+    says(str(log.damage), "last beam at -1.000 rad by angle_increment, 1.000 by angle_max: angle_max used")
+    with pytest.raises(InputError, match="0 rad apart"):
+        only_scan(tmp_path, scan_said(STAMP_NS, degenerate))
+
+
+@pytest.mark.parametrize(
+    ("step", "last", "is_said"),
+    [
+        (-0.02, 1.0, True),  # of the other sense
+        (0.01, 1.0, True),
+        (0.02, 1.04, False),  # one or two beams more or fewer, as of drivers that count ends and steps differently
+        (0.02, 0.96, False),
+        (0.02, np.nan, False),
+    ],
+)
+def test_angles_that_contradict_each_other_are_told(tmp_path, step, last, is_said):
+    message = ROS.laser_scan(STAMP_NS, np.full(101, 2.0, "f4"), first=-1.0, step=step)
+    message.angle_max = last
+    data = ROS.serialize(message, "sensor_msgs/msg/LaserScan")
+    log = open_log(write(tmp_path / "a.mcap", [scan_said(STAMP_NS, data)]))
+    list(log.scans())
+    assert ("the angles of 1 of 1 scan of /scan contradict each other" in str(log.damage)) == is_said
 
 
 def test_beams_without_return_are_dropped_with_their_times_and_counted(tmp_path):
@@ -126,6 +161,8 @@ SCATTERED = np.dtype({
         *((ROWS, {"height": height, "padding": padding}) for height in (1, 4) for padding in (0, 7)),
         (ROWS, {"height": 4, "padding": 5, "data": (5 * b"\xff").join(r.tobytes() for r in ROWS.reshape(4, 6))}),
         (ROWS, {"row_step": 0}),
+        (ROWS, {"height": 4, "row_step": 0}),  # Velodyne's driver
+        (ROWS, {"height": 4, "row_step": ROWS.nbytes}),  # PointCloud2Modifier::resize(width, height)
         (random_rows(SCATTERED), {}),
         (random_rows([*XYZ, ("inten", "u1")]), {"frame": "inten"}),
     ],
@@ -178,6 +215,12 @@ STAMP_S = STAMP_NS * 1e-9
             for name in ("t", "time", "timestamp", "offset_time", "time_offset")
             for code in ("<u4", ">u4", "<i4", "<f4", "<f8")
         ),
+        *(
+            (name, "<i4", np.rint(RISING_S * 1e9), RISING_S, 1e-7)
+            for name in ("time_offset_ns", "point_time_offset")
+        ),
+        *((name, "<f4", RISING_S, RISING_S, 1e-7) for name in ("ts", "stamps", "Time", "scalar_GpsTime", "t_us")),
+        ("timestamp", "<u8", STAMP_NS + np.rint(RISING_S * 1e9).astype("u8"), RISING_S, 1e-9),
         ("timestamp", "<f8", STAMP_S + RISING_S, RISING_S, 1e-6),
         ("timestamp", "<f8", STAMP_NS + RISING_S * 1e9, RISING_S, 1e-6),
         *(("timestamp", "<f8", STAMP_S + off_s + RISING_S, RISING_S, 1e-6) for off_s in (37.0, -37.0, 1800.0)),
@@ -199,6 +242,13 @@ def test_the_unit_and_the_origin_of_times_are_those_that_their_values_suggest(
     times_s = cloud(tmp_path, rows).times_s
     assert times_s.dtype == np.float32
     np.testing.assert_allclose(times_s, expected_s, atol=within_s)
+
+
+def test_of_several_fields_with_times_the_likeliest_that_varies_is_read_and_one_of_another_name_is_none(tmp_path):
+    rows = np.ones(11, [*XYZ, ("runs", "f4"), ("stamp", "f4"), ("time", "f4"), ("timestamp", "f4")])
+    rows["runs"], rows["stamp"], rows["time"], rows["timestamp"] = RISING_S, 3.0 * RISING_S, 0.0, 2.0 * RISING_S
+    np.testing.assert_allclose(cloud(tmp_path, rows).times_s, 2.0 * RISING_S, atol=1e-7)
+    assert not len(cloud(tmp_path, rows[["x", "y", "z", "runs"]].astype([*XYZ, ("runs", "f4")])).times_s)
 
 
 def test_an_undefined_time_of_a_dropped_point_harms_no_other(tmp_path):

@@ -68,7 +68,7 @@ class Ros:
         row_step=None,
     ):  # fmt: skip
         """A cloud of a structured array; ``padding`` bytes behind each row; other arguments tell lies."""
-        codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+        codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8, "u8": 10}
         names, width = rows.dtype.names, len(rows) // height
         if fields is None:
             fields = [(name, rows.dtype.fields[name][1], codes[rows.dtype[name].str[1:]], 1) for name in names]

@@ -91,7 +91,7 @@ class ScanCounts:
         self.farthest_back_ns = self.begin_ns = 0
         self.publishers: dict[str, _Tally] = {}
         self.jumps_s, self.first_jump = list[float](), ""
-        self.first_complaint = ""
+        self.first_complaint, self.odd = "", list[str]()
         self.steps_ns = [(0, 0)]  # steps of header stamp and log time from scan to scan, without jumps
         self._last: Scan | None = None
 
@@ -113,6 +113,7 @@ class ScanCounts:
         tally.messages += 1
         tally.with_returns += len(returns.points) > 0
         tally.end_ns = returns.stamp_ns
+        self.odd += filter(None, [returns.odd])
         return tally.is_used
 
     def repeats(self, points: RawPoints) -> bool:
@@ -169,6 +170,10 @@ class ScanCounts:
         if self.bad:
             were = "was" if self.bad == 1 else "were"
             lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
+        if self.odd:
+            lines.append(
+                f"the angles of {self._share(len(self.odd))} contradict each other (the first: {self.odd[0]})"
+            )
         if self.repeated > _MOST_REPEATED * self.scans:
             lines.append(
                 f"{self._share(self.repeated)} have the header stamp of the previous one: times in the results do "

@@ -28,6 +28,7 @@ from scanchain.logs.messages.ros import (
 
 _NEAREST_M, _FARTHEST_M = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)  # of any range
 _MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; above it angles are in degrees
+_MOST_APART = 0.02  # largest difference of angle_max and the last beam, as a share of the angle that is covered
 _PLANAR_M = 5e-4  # largest distance of a point from the plane of a planar cloud: rounding of float32
 _LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
 _LIVOX_FIELDS = (("offset_time", 0, 6), ("x", 4, 7), ("y", 8, 7), ("z", 12, 7))
@@ -51,18 +52,20 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
     """Valid returns of a laser scan: finite, at least range_min, below range_max.
 
     Scanners report range_max or more for a beam without return, and zero for an invalid one; limits that are not
-    positive count as unknown. Angle increments may be negative.
+    positive count as unknown. Angle increments may be negative; one of zero is unset, and follows from angle_max.
     """
     message, T_frame_points = read(data)
     ranges_m = message.ranges
     low_m = max(message.range_min if message.range_min > 0.0 else 0.0, config.min_range_m, _NEAREST_M)
     high_m = min(message.range_max if message.range_max > 0.0 else _FARTHEST_M, config.max_range_m, _FARTHEST_M)
-    directions = _directions(message.angle_min, message.angle_increment, len(ranges_m))
+    covered_rad, steps = message.angle_max - message.angle_min, max(len(ranges_m) - 1, 1)
+    step_rad = message.angle_increment or covered_rad / steps
+    directions = _directions(message.angle_min, step_rad, len(ranges_m))
     valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
     points = directions[valid] * ranges_m[valid, None]
     times_s, stated = NO_TIMES, None
     if config.point_times in UNITS_S or config.point_times == "auto":
-        turns = abs(message.angle_increment) * len(ranges_m) / (2.0 * np.pi)
+        turns = abs(step_rad) * len(ranges_m) / (2.0 * np.pi)
         stated = Beams(valid, len(ranges_m), turns, message.time_increment, message.scan_time)
         times_s = stated.seconds(UNITS_S.get(config.point_times, 1.0) * message.time_increment)
     elif config.point_times not in ("none", "azimuth"):
@@ -70,13 +73,18 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
     points = moved(points, T_frame_points).astype(np.float32, copy=False)
     why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
     count = len(ranges_m) - len(valid)
-    return Returns(stamp_ns(message), points, times_s, count, why, frame_of(message), stated)
+    apart_rad, odd = abs(steps * message.angle_increment - covered_rad), ""
+    if apart_rad > _MOST_APART * abs(covered_rad) + 3.0 * abs(message.angle_increment):
+        last_rad = message.angle_min + steps * message.angle_increment
+        used = "angle_increment" if message.angle_increment else "angle_max"
+        odd = f"last beam at {last_rad:.3f} rad by angle_increment, {message.angle_max:.3f} by angle_max: {used} used"
+    return Returns(stamp_ns(message), points, times_s, count, why, frame_of(message), stated, odd=odd)
 
 
 @lru_cache(16)  # few scanners have more than one geometry
 def _directions(first_rad: float, step_rad: float, count: int) -> NDArray[np.float32]:
     """Directions (N, 2) of the beams."""
-    if not isfinite(first_rad + step_rad * count):
+    if not isfinite(first_rad + step_rad * count) or (step_rad == 0.0 and count > 1):
         raise MalformedMessageError(
             f"its beams begin at {first_rad:g} rad and are {step_rad:g} rad apart, which is impossible"
         )
@@ -133,6 +141,8 @@ def decode_cloud(
         values = cloud[name] if count == len(cloud) else cloud[name][valid[:count]]
         stated = times.from_field(name, stamp_ns(message), values)
         times_s = stated.seconds(stamp_ns(message)) if stated.span else NO_TIMES
+        if stated.core > 0.0:
+            break
     if times.by_azimuth:
         times_s = from_azimuth(points[:count], times.config)
     points = moved(points[:count], T_frame_points)
@@ -171,7 +181,7 @@ def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def _layout(message: Any, times: PointTimes) -> np.dtype[np.void]:
-    """A point as a structured type: x, y, z and the time field, if any."""
+    """A point as a structured type: x, y, z and the fields with times."""
     if message.point_step >= 1 << 31:
         raise MalformedMessageError(f"point_step {message.point_step} is too large for a point")
     fields = {field.name: field for field in message.fields}
@@ -179,12 +189,14 @@ def _layout(message: Any, times: PointTimes) -> np.dtype[np.void]:
         raise MalformedMessageError(
             f"the cloud has no field {' '.join(missing)} (it has: {', '.join(fields) or 'none'})"
         )
-    chosen = ["x", "y", "z", *[name for name in times.fields if name in fields][:1]]
+    chosen = ["x", "y", "z", *times.fields(fields)]
     numbers: list[np.dtype[np.generic]] = []
     for name in chosen:
         field = fields[name]
         if field.datatype not in NUMBERS:
-            raise MalformedMessageError(f"field {name} has data type {field.datatype}; PointField defines 1 to 8")
+            raise MalformedMessageError(
+                f"field {name} has data type {field.datatype}; PointField defines 1 to 8, PCL 9 and 10"
+            )
         numbers.append(np.dtype((">" if message.is_bigendian else "<") + NUMBERS[field.datatype]))
         end = field.offset + numbers[-1].itemsize
         if end > message.point_step:
@@ -199,7 +211,8 @@ def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:
     """All points of all rows, without the padding after each row."""
     height, width, body = message.height, message.width, message.data
     row = width * point.itemsize
-    stride = message.row_step if height > 1 else row
+    # drivers of packed points state 0, as of an empty cloud, or the bytes of all rows
+    stride = row if height <= 1 or len(body) == height * row else message.row_step
     if stride < row:
         raise MalformedMessageError(f"row_step {stride} is less than the {row} bytes of {width} points")
     needed = (height - 1) * stride + row if height and width else 0

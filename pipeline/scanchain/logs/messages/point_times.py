@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise
@@ -21,7 +22,8 @@ from scanchain.logs.index import Decoded
 
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
-_NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
+_NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")  # the most likely
+_NAME = re.compile(r"ts?|t_?(ms|us|ns|offset)|.*(time|stamp).*", re.IGNORECASE)  # of a field with times
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO, _AT_ONCE = "no point times", "every scan counts as measured at once"
@@ -122,6 +124,7 @@ class Returns(NamedTuple):
     dropped : number of invalid returns; why : reason if no return is valid
     stated : times as in the message
     others : sweeps of other lidars, in the frame of the first publisher of the topic
+    odd : contradiction in the angles of a laser scan, as text
     """
 
     stamp_ns: int
@@ -132,6 +135,7 @@ class Returns(NamedTuple):
     frame: str = ""
     stated: Field | Beams | None = None
     others: tuple[OtherPoints, ...] = ()
+    odd: str = ""
 
     @property
     def middle_ns(self) -> int:
@@ -161,7 +165,6 @@ class PointTimes:
     the majority in the sweep, the period and the neighboring sweeps: times after a wrap or reset of a counter are
     repaired, points with other wrong times removed, and all times of a sweep with mostly wrong ones ignored.
 
-    fields : names of fields with times, the most likely first
     assumed : note on the assumed unit and origin, from one of the first scans with times; empty if needless
     spans_s, periods_s : usual duration of sweeps and time between them, at each sweep
     """
@@ -170,7 +173,7 @@ class PointTimes:
         self.config = config
         self.unit = config.point_times if config.point_times in UNITS_S else ""
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
-        self.fields = _NAMES if self.unit or config.point_times == "auto" else ()
+        self.reads_fields = bool(self.unit) or config.point_times == "auto"
         self.assumed = UNTIMED
         if self.by_azimuth:
             turn = f"{config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s per turn"
@@ -179,6 +182,11 @@ class PointTimes:
         self.periods_s: list[float] = []
         self._number = self._counted = 0
         self._tallies: dict[str, list[tuple[str, int]]] = {}  # by treatment: the scans and numbers of points
+
+    def fields(self, names: Iterable[str]) -> list[str]:
+        """Those of the names that are of fields with times, the most likely first; none if times are not read."""
+        found = [name for name in names if self.reads_fields and _NAME.fullmatch(name)]
+        return sorted(found, key=lambda name: _NAMES.index(name) if name in _NAMES else len(_NAMES))
 
     def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> Field:
         """Values (N,), N > 0, of a field, with the unit and the origin that most of them suggest.

@@ -8,7 +8,8 @@ from typing import Any
 
 from scanchain.errors import one_line, printable
 
-NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of sensor_msgs/PointField
+# of sensor_msgs/PointField, and 9 and 10 of PCL
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _GPS = {  # of gps_msgs and gps_common: the types of the fields, each with names
     "GPSStatus": (
