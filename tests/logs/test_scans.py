@@ -16,6 +16,7 @@ from scanchain.logs import open_log, stream
 from scanchain.logs.info import describe
 from scanchain.logs.opening import index_files
 from tests.support import made
+from tests.support.messages import says
 from tests.support.naive_logs import (
     SECOND,
     STAMP_NS,
@@ -291,6 +292,14 @@ def test_the_mounting_is_that_of_the_static_transforms(tmp_path, entries, wheels
     assert note in log.notes[0] if note else log.notes == []
 
 
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_transform_of_another_frame_that_is_no_pose_costs_no_mounting(tmp_path, moving):
+    told = transforms(("base_link", "arm", np.nan, 0.0, 0.0, 0.0), ("base_link", *MAST), LASER)
+    said = [transforms_said(STAMP_NS, told, *(["/tf"] if moving else [])), one_scan(0.1, 0.1)]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    np.testing.assert_allclose(log.stated_mounting, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
+
+
 def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
     yaw, x, y = 0.4, 0.2, -0.1
     said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", x, y, yaw, np.pi))), one_scan(0.1, 0.1)]
@@ -523,6 +532,45 @@ def test_kitti_ground_truth_is_that_of_the_published_file():
     np.testing.assert_allclose(truth.stamps_ns * 1e-9, published[:, 0], atol=1e-5)
     np.testing.assert_allclose(truth.poses[:, :3, 3], published[:, 1:4], atol=1e-6)
     np.testing.assert_allclose(truth.poses[:, :3, :3], lie.from_quaternion(published[:, 4:]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "config", "x", "note"),
+    [
+        (
+            [],
+            {},
+            0.0,
+            ["poses of base_link, taken as the lidar's, as no transform states where it is on base_link"],
+        ),
+        (
+            [("base_link", "laser", 0.5, 0.0, 0.0, 0.0)],
+            {},
+            0.5,
+            ["poses of base_link, moved to the lidar, at x 0.500 m, y 0.000 m"],
+        ),
+        ([], {"lidar_pose": "0.7 0 0 0 0 0 1"}, 0.7, ["poses of base_link, moved to the lidar, at x 0.700 m"]),
+    ],
+)
+def test_true_poses_of_the_base_are_moved_to_the_lidar_or_it_is_told_that_they_are_not(
+    tmp_path, fixed, config, x, note
+):
+    said = [transforms_said(STAMP_NS, transforms(*fixed))] if fixed else []
+    said += [one_scan(0.1, 0.1), *wheels((0.1, 0.1, 2.0), topic="/ground_truth")]
+    log = open_log(write(tmp_path / "a.mcap", said), LogConfig(**config))
+    list(log.scans())
+    assert log.ground_truth().poses[0, 0, 2] == 2.0 + x
+    says(str(log.notes), *note)
+
+
+@pytest.mark.parametrize("topic", ["/base_pose_ground_truth", "/robot/gt/odom", "/vicon/odometry"])
+def test_an_odometry_of_true_poses_is_no_prior_unless_it_is_named(tmp_path, topic):
+    said = [one_scan(0.1, 0.1), *wheels((0.1, 0.1, 2.0), topic=topic)]
+    path = write(tmp_path / "a.mcap", said)
+    assert not open_log(path).odometry_topic
+    assert open_log(path, odometry_topic=topic).odometry_topic == topic
+    log = open_log(write(tmp_path / "b.mcap", said + wheels((0.1, 0.1, 1.0))))
+    assert log.odometry_topic == "/odom" and log.notes[0].startswith("no static transform")
 
 
 def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own_and_no_prior_and_can_be_left_unused(tmp_path):

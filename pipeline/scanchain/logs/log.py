@@ -318,12 +318,13 @@ class Log:
             self._truth = recorded.ground_truth(self._lidar_on)
         return self._truth
 
-    def _lidar_on(self, frame: str) -> Pose:
-        """T_frame_lidar (d+1, d+1), the identity if no fixed transform gives it."""
+    def _lidar_on(self, frame: str) -> Pose | None:
+        """T_frame_lidar (d+1, d+1), None if neither ``log.lidar_pose`` nor a fixed transform gives it."""
+        if self.config.lidar_pose and frame == (self.mounting.base or "base_link"):
+            return self.T_base_lidar
         is_other = frame not in ("", self.publishers.frame)
-        T = between_frames(self.indexes, self.span, frame, self.publishers.frame) if is_other else None
-        T = np.eye(4) if T is None else T
-        return in_plane(T) if self.dimension == 2 else T
+        T = between_frames(self.indexes, self.span, frame, self.publishers.frame) if is_other else np.eye(4)
+        return in_plane(T) if T is not None and self.dimension == 2 else T
 
     def _sample_decoders(self, wheels: Wheels | None, truth: Channel | None) -> dict[str, Read]:
         """Readers of the messages of the other sensors, by topic."""

@@ -17,7 +17,7 @@ from scanchain.logs.messages.inertial import ImuSample
 from scanchain.logs.messages.point_times import Returns
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.ros import MalformedMessageError
-from scanchain.logs.mounting import Sensor
+from scanchain.logs.mounting import Sensor, place_text
 
 NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and, with its delay added, that a scan waits
 HOLD_SCANS = 32  # largest number of scans that wait for samples, or for points of other lidars; limits memory
@@ -136,7 +136,7 @@ class Recorded:
         self.streams: dict[str, SampleStream[Any]] = {topic: stream for topic, stream in named.items() if topic}
         self.ground_truth_topic = ground_truth_topic
         self.truth: list[StampedPose] = []
-        self._moved = ""  # frames of the truth other than the lidar's
+        self._frames: dict[str, Pose | None] = {}  # of the truth, with the lidar's pose in each if it is known
         self._malformed: dict[str, list[str]] = {}  # by topic, the defect of each message
 
     def add(self, message: Decoded) -> None:
@@ -189,22 +189,27 @@ class Recorded:
         stamps_ns, _, positions, covariances = zip(*found, strict=True)
         return Fixes(np.array(stamps_ns, np.int64), np.array(positions), np.array(covariances), self.antenna_m)
 
-    def ground_truth(self, lidar_on: Callable[[str], Pose]) -> Trajectory | None:
+    def ground_truth(self, lidar_on: Callable[[str], Pose | None]) -> Trajectory | None:
         """True poses of the lidar so far; None if there are none.
 
-        lidar_on : pose of the lidar in a frame, the identity if the poses of that frame are the lidar's
+        lidar_on : pose of the lidar in a frame, None if it is unknown: poses of that frame count as the lidar's
         """
         if not self.truth:
             return None
         stamps_ns = np.array([pose.stamp_ns for pose in self.truth], np.int64)
-        T_of = {child: lidar_on(child) for child in {pose.child for pose in self.truth}}
-        self._moved = ", ".join(child for child, T in T_of.items() if not np.array_equal(T, np.eye(len(T))))
-        return Trajectory(stamps_ns, np.array([pose.T_parent_child @ T_of[pose.child] for pose in self.truth]))
+        self._frames = {child: lidar_on(child) for child in {pose.child for pose in self.truth}}
+        poses = [(pose.T_parent_child, self._frames[pose.child]) for pose in self.truth]
+        return Trajectory(stamps_ns, np.array([T if T_child is None else T @ T_child for T, T_child in poses]))
 
     def notes(self) -> list[str]:
-        """Note on a ground truth of another frame than the lidar's."""
-        moved = f"{self.ground_truth_topic}: poses of {self._moved}, moved to the lidar by the transforms"
-        return [moved] if self._moved else []
+        """Notes on a ground truth of other frames than the lidar's."""
+        used = "taken as the lidar's, as no transform states where it is on"
+        done = {
+            child: f"{used} {child}" if T is None else f"moved to the lidar, at {place_text(T)}"
+            for child, T in self._frames.items()
+            if T is None or not np.array_equal(T, np.eye(len(T)))
+        }
+        return [f"{self.ground_truth_topic}: poses of {child}, {how}" for child, how in done.items()]
 
     def losses(self) -> list[str]:
         """Warning for each topic with malformed messages."""

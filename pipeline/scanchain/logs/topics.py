@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is
 
 _MOST_LISTED = 8  # largest number of topics in an error
 _USUAL_TRUTH = LogConfig().ground_truth_topic
+_TRUTH_WORDS = {"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack"}  # of topics with true poses
 _USES = {
     "imu": ("IMU", "predicts motions where it does so better than the scans"),
     "gnss": ("GNSS", "its fixes give the place on Earth, and correct drift where they show any"),
@@ -58,7 +60,7 @@ def _lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 
 
 def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[str]) -> Channel | None:
-    """The wheel odometry's channel: the configured topic, else the only one other than ground truth.
+    """The wheel odometry's channel: the configured topic, else the only one that is not of true poses.
 
     None if there are several. Without any, the first topic of moving transforms, which may contain it.
     """
@@ -67,13 +69,17 @@ def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[s
         return named[0]
     if config.odometry_topic:
         return _chosen(indexes, config.odometry_topic, "log.odometry_topic")
-    truths = config.ground_truth_topic, _USUAL_TRUTH
-    found = [each for each in topics_of(indexes).values() if role(each) == "odometry" and each.topic not in truths]
+    found = [each for each in topics_of(indexes).values() if role(each) == "odometry"]
+    found = [each for each in found if each.topic != config.ground_truth_topic and not _is_truth(each.topic)]
     if len(found) > 1:
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
         return None
     return next(iter([*found, *moving]), None)
+
+
+def _is_truth(topic: str) -> bool:
+    return not _TRUTH_WORDS.isdisjoint(re.split(r"[/_]", topic.lower()))
 
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -140,8 +141,12 @@ def frame_transform(message: _FrameTransform, link: Frames | None = None, dimens
 
 
 def frame_transforms(message: _FrameTransforms, **chosen: Any) -> list[StampedPose]:
-    """All transforms of a foxglove.FrameTransforms, or those between the frames of ``link``."""
-    return [transform for each in message.transforms for transform in frame_transform(each, **chosen)]
+    """Transforms of a foxglove.FrameTransforms, as ``read_transforms`` returns them."""
+    found = list[StampedPose]()
+    for each in message.transforms:
+        with suppress(*() if chosen.get("link") else (MalformedMessageError,)):
+            found += frame_transform(each, **chosen)
+    return found
 
 
 def location_fix(message: _LocationFix) -> Fix:

@@ -77,7 +77,8 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
     if apart_rad > _MOST_APART * abs(covered_rad) + 3.0 * abs(message.angle_increment):
         last_rad = message.angle_min + steps * message.angle_increment
         used = "angle_increment" if message.angle_increment else "angle_max"
-        odd = f"last beam at {last_rad:.3f} rad by angle_increment, {message.angle_max:.3f} by angle_max: {used} used"
+        both = f"{last_rad:.3f} rad by angle_increment, {message.angle_max:.3f} by angle_max"
+        odd = f"last beam at {both}: {used} used"
     return Returns(stamp_ns(message), points, times_s, count, why, frame_of(message), stated, odd=odd)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from math import isfinite, sqrt
 from typing import Any, NamedTuple
 
@@ -41,13 +42,17 @@ Frames = tuple[str, str]  # parent and child
 
 
 def read_transforms(message: Any, link: Frames | None = None, dimension: int = 3) -> list[StampedPose]:
-    """Transforms of a tf2_msgs/TFMessage, all or those of the frames ``link``; flattened for dimension 2."""
-    found = []
+    """Transforms of a tf2_msgs/TFMessage, all or those of the frames ``link``; flattened for dimension 2.
+
+    Raises MalformedMessageError for one of the link that is no pose; others that are none are left out, as in tf2.
+    """
+    found = list[StampedPose]()
     for each in message.transforms:
         frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
         if link in (None, frames):
-            T = pose_of(each.transform.translation, each.transform.rotation, dimension)
-            found.append(StampedPose(stamp_ns(each), *frames, T))
+            with suppress(*() if link else (MalformedMessageError,)):
+                T = pose_of(each.transform.translation, each.transform.rotation, dimension)
+                found.append(StampedPose(stamp_ns(each), *frames, T))
     return found
 
 
