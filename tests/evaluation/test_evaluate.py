@@ -308,6 +308,12 @@ def test_truth_without_a_pose_beside_the_estimate_is_refused_with_the_reason():
     assert len(ev.pair(late, sparse, gap_s=2.0)) == 80 and len(ev.pair(truth, one)) == 1
 
 
+def test_stamps_that_are_all_the_same_pair_nothing(pairs):
+    unset = Trajectory(np.zeros(len(pairs), np.int64), pairs.estimate)
+    with pytest.raises(InputError, match=r"poses that can be paired all have the stamp 0\.000 s"):
+        ev.pair(unset, Trajectory(unset.stamps_ns, pairs.reference))
+
+
 def test_truth_that_may_mislead_is_warned_of():
     every = at_rate(drive(100), 1, late_ns=50_000_000)
     (sparse,) = ev.pair(every, at_rate(drive(100), 20), gap_s=2.0).warnings

@@ -55,13 +55,25 @@ def test_a_log_may_be_packed_whatever_its_name(tmp_path, pack):
 
 @pytest.mark.parametrize(
     ("beams", "first", "step"),
-    [(180, -90, 1), (181, -90, 1), (360, -90, 0.5), (361, -90, 0.5), (401, -50, 0.25), (91, -90, 2)],
-)
+    [
+        (180, -90, 1), (181, -90, 1), (360, -90, 0.5), (361, -90, 0.5), (401, -50, 0.25), (541, -135, 0.5),
+        (682, -340.5 * 360 / 1024, 360 / 1024), (1081, -135, 0.25), (91, -90, 2),
+    ],
+)  # fmt: skip
 def test_the_number_of_beams_tells_their_angles(tmp_path, beams, first, step):
-    _, (scan,) = read(save(tmp_path / "a.log", flaser(0, np.full(beams, 2.0))))
+    log, (scan,) = read(save(tmp_path / "a.log", flaser(0, np.full(beams, 2.0))))
+    assert ("state no angles: 91 beams are taken as those of 180 deg" in str(log.notes)) == (beams == 91)
     np.testing.assert_allclose(
         scan.points, points(np.full(beams, 2.0), np.radians(first), np.radians(step)), atol=1e-5
     )
+
+
+def test_a_parameter_tells_the_step_of_an_unusual_number_of_beams(tmp_path):
+    lines = ["PARAM laser_front_laser_resolution 0.5 nohost 0", flaser(0, np.full(201, 2.0))]
+    log, (scan,) = read(save(tmp_path / "a.log", *lines))
+    expected = points(np.full(201, 2.0), np.radians(-50.0), np.radians(0.5))
+    np.testing.assert_allclose(scan.points, expected, atol=1e-5)
+    assert "angles" not in str(log.notes)
 
 
 def test_the_codes_of_a_sick_for_no_return_are_dropped(tmp_path):

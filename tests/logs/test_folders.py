@@ -251,6 +251,14 @@ def test_folders_of_arrays_open_whatever_their_columns_and_say_what_was_found(tm
     assert f"{len(clouds[0])} points in 0{suffix}" in log.notes[0]
 
 
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+def test_columns_of_a_bin_file_that_are_those_of_another_number_are_a_warning_with_the_flag(tmp_path, columns):
+    swept(0, 240)[:, :columns].astype("f4").tofile(tmp_path / "0.bin")  # the bytes are a multiple of all
+    for stated in (4, columns):
+        log, _ = read(tmp_path, rate_hz=10.0, bin_columns=stated)
+        assert (f"set --log.bin_columns {columns}" in str(log.damage)) == (stated != columns)
+
+
 @pytest.mark.parametrize("kind", ["float16", "int32", "int64", ">f4", ">f8"])
 def test_arrays_of_any_number_type_and_with_named_fields_are_read(tmp_path, kind):
     cloud = np.rint(swept(1)[:, :3]).astype(kind)

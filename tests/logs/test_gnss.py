@@ -90,11 +90,12 @@ def test_without_a_fix_there_is_none_and_an_unknown_covariance_is_replaced(log, 
     assert fixes[0].antenna_m is None
 
 
-def test_a_position_that_is_none_on_earth_is_left_out_and_counted(log, tmp_path):
-    logs = with_fixes(log, tmp_path, ((91.0, 0.0, 0.0), (1.0,) * 3), ((np.nan, 0.0, 0.0), (1.0,) * 3))
+def test_a_position_that_is_none_on_earth_or_unset_is_left_out_and_counted(log, tmp_path):
+    bad = (91.0, 0.0, 0.0), (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0)
+    logs = with_fixes(log, tmp_path, *((each, (1.0,) * 3) for each in bad))
     opened = scanchain.open_log(logs, gnss_topic="/b")
     assert not fixes_of(opened)
-    assert any("2 malformed messages of /b left out" in line for line in opened.damage)
+    assert any("3 malformed messages of /b left out" in line for line in opened.damage)
 
 
 def test_none_leaves_it_unused_of_several_none_is_used_and_another_topic_is_refused(log, tmp_path):

@@ -54,6 +54,13 @@ def test_a_small_delay_is_none_and_parts_of_a_log_add_up():
     assert parts.is_clear and not WheelDelay().is_clear
 
 
+def test_stamps_that_are_all_the_same_show_no_delay():
+    found, poses = WheelDelay(), base_at(TIMES_S)
+    for pose in poses:
+        found.update(0, pose, pose, is_known=True)
+    assert found.seconds == 0.0 and not found.is_clear
+
+
 def test_motions_within_the_largest_delay_of_the_ends_of_the_path_are_not_covered():
     path = WheelPath(TIMES_S, base_at(TIMES_S))
     ends_s = np.array([[0.5, 0.6], [1.5, 1.6], [58.8, 58.95], [58.8, 58.85]])

@@ -152,6 +152,11 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     )
     if not known.any():
         raise InputError(_no_pairs(estimate, reference, gap_ns * 1e-9))
+    if known.sum() > 1 and not np.ptp(wanted_ns[known]):
+        same = f"all have the stamp {1e-9 * wanted_ns[known][0]:.3f} s"
+        raise InputError(
+            f"the {known.sum():,} poses that can be paired {same}: no true pose is known to be theirs"
+        )
     return Pairs(
         stamps_ns=wanted_ns[known],
         estimate=lie.lift(estimate.poses[known]),

@@ -117,11 +117,10 @@ class WheelDelay:
         self.odds, self.block, self.is_clear = odds, [], likeliest(0.5 * odds) is not None
 
     def _of_block(self) -> Vector:
-        if len(self.block) < FEWEST:
+        times_s, first = np.unique([time_s - self.block[0][0] for time_s, *_ in self.block], return_index=True)
+        if len(times_s) < FEWEST:
             return np.zeros(len(_DELAYS_S))
-        times_s, lidar, base, known = (np.array(each) for each in zip(*self.block, strict=True))
-        times_s, first = np.unique(times_s - times_s[0], return_index=True)
-        lidar, base, known = lidar[first], base[first], known[first]
+        _, lidar, base, known = (np.array(each)[first] for each in zip(*self.block, strict=True))
         path = WheelPath(times_s, base if base.shape[-1] == 3 else lie.flatten(base))
         ends_s = np.column_stack([times_s[:-1], times_s[1:]])
         chosen = known[:-1] & known[1:] & (np.diff(times_s) < LONGEST_S) & path.covers(ends_s)

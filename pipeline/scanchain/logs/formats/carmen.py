@@ -27,11 +27,15 @@ from scanchain.logs.formats.mcap import temporary_index
 from scanchain.logs.index import FileIndex, most_decompressed_file
 
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
+_RESOLUTION = b"laser_front_laser_resolution"  # parameter with the step of a scanner in degrees
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
 SCANS = (b"FLASER", b"ROBOTLASER1")
 _LEAST_CODE_M = 81.83  # smallest range in meters that a SICK LMS uses as an error code, such as for no return
-_STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
+# by the number of beams of SICK's and Hokuyo's scanners, as in GMapping and CARMEN
+_STEPS_DEG = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5, 401: 0.25, 540: 0.5, 541: 0.5, 1081: 0.25}
+_STEPS_DEG |= {682: 360.0 / 1024.0, 683: 360.0 / 1024.0, 769: 360.0 / 1024.0}
+_FROM_THE_RIGHT = 180, 181, 360, 361  # number of beams of which the first is at −90 degrees; others are centered
 _LONGEST_LINE = 1 << 18  # largest length of a line in bytes; a longer one is malformed
 
 
@@ -45,8 +49,10 @@ def is_carmen(_: Path, head: bytes) -> bool:
 def index_carmen(path: Path, number: int, _: LogConfig) -> FileIndex:
     """Index of the messages of a log's lines. Raises UnknownFormatError if no line is of a known kind."""
     malformed, damage = [0, 0], list[str]()
-    others = Counter[bytes]()
-    index = temporary_index(path, number, lambda log: _write(log, read_lines(path, damage), malformed, others))
+    others, guessed = Counter[bytes](), set[int]()
+    index = temporary_index(
+        path, number, lambda log: _write(log, read_lines(path, damage), malformed, others, guessed)
+    )
     if not index.counts and not malformed[1]:
         absent = f"text without a line of {b', '.join(KINDS).decode()}"
         text = b"\n".join(islice(read_lines(path, []), 256))  # from which other formats are recognized
@@ -58,14 +64,23 @@ def index_carmen(path: Path, number: int, _: LogConfig) -> FileIndex:
     if others:
         listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in others.items())
         index.notes.append(f"{path}: lines of kinds that are not supported: {printable(listed)}")
+    for beams in sorted(guessed):
+        index.notes.append(f"{path}: FLASER lines state no angles: {beams} beams are taken as those of 180 deg")
     return index
 
 
-def _write(log: writer.LogWriter, lines: Iterator[bytes], malformed: list[int], others: Counter[bytes]) -> None:
+def _write(
+    log: writer.LogWriter,
+    lines: Iterator[bytes],
+    malformed: list[int],
+    others: Counter[bytes],
+    guessed: set[int],
+) -> None:
     """Write the messages of each line of a known kind.
 
     malformed : set to the number of the first malformed line and the count of malformed lines
     others : incremented by the number of lines of each unknown kind
+    guessed : extended by the numbers of beams that do not tell their angles
     """
     parameters: dict[bytes, float] = {}
     scan_ns, is_mounted = 0, False
@@ -90,6 +105,8 @@ def _write(log: writer.LogWriter, lines: Iterator[bytes], malformed: list[int], 
                 log.append(topic, "nav_msgs/msg/Odometry", packed, stamp_ns, max(stamp_ns, scan_ns))
                 continue
             scan, robot, laser = read_scan(words, stamp_ns, parameters)
+            if kind == b"FLASER" and int(words[1]) not in _STEPS_DEG and not parameters.get(_RESOLUTION):
+                guessed.add(int(words[1]))
         except (ValueError, IndexError, OverflowError):
             malformed[:] = malformed[0] or number, malformed[1] + 1
             continue
@@ -106,16 +123,17 @@ def _write(log: writer.LogWriter, lines: Iterator[bytes], malformed: list[int], 
 def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float]) -> tuple[bytes, Any, Any]:
     """Message of a FLASER or ROBOTLASER1 line, the robot's pose, and the pose of the laser on the robot.
 
-    parameters : the scanner's maximum range and its forward offset from the robot's center, as set by the log's
-        PARAM lines for FLASER; ROBOTLASER1 lines state both themselves
+    parameters : the scanner's maximum range, its step, and its forward offset from the robot's center, as set by
+        the log's PARAM lines for FLASER; ROBOTLASER1 lines state these themselves
     Raises ValueError or IndexError if words are missing or not numbers.
     """
     offset_m, max_range_m = (parameters.get(name, 0.0) for name in _PARAMETERS)
     if words[0] == b"FLASER":
         count = int(words[1])
         poses = _numbers(words[2 + count :], 6)
-        step_rad = _STEPS_RAD.get(count, math.pi / max(count - 1, 1))
-        first_rad = -0.5 * step_rad * (count - 1) if count == 401 else -0.5 * math.pi
+        step_deg = _STEPS_DEG.get(count) or parameters.get(_RESOLUTION) or 180.0 / max(count - 1, 1)
+        step_rad = math.radians(step_deg)
+        first_rad = -0.5 * math.pi if count in _FROM_THE_RIGHT else -0.5 * step_rad * (count - 1)
         ranges_m = _numbers(words[2:], count)
         mounting = planar(offset_m, 0.0, 0.0)
     else:

@@ -40,6 +40,9 @@ _PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+_FEWEST_ROWS, _MOST_ROWS = 100, 10_000  # number of points of a .bin file that tell its columns
+# shares of the variance between columns: that of the right number at least, and the most, over it, of a wrong one
+_APART, _ALIKE = 0.2, 0.5
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 _ONE_AT_A_TIME = Lock()  # for .npy headers: NumPy parses them with ast, which is not thread-safe in Python 3.11
@@ -243,6 +246,9 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
             "their number, as in --log.bin_columns 5, or save clouds as .npy, PCD or PLY"
         )
     index.notes += [*_found(folder, files, raw), *left_out(folder, suffix, SUFFIXES)]
+    if suffix == ".bin" and (columns := _columns(files[0], config.bin_columns)) != config.bin_columns:
+        wrong = f"its numbers are those of {columns} columns, not of {config.bin_columns}, and points are wrong"
+        index.add_damage(f"{files[0]}: {wrong}: set --log.bin_columns {columns}")
     channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
     for place, (size, stamp_ns) in enumerate(zip(sizes, stamps_ns, strict=True)):
         add_block(index, place, size, [stamp_ns], {channel: 1})
@@ -252,6 +258,24 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
 
     index.contents = make
     return index
+
+
+def _columns(file: Path, stated: int) -> int:
+    """Number of columns of a .bin file: ``stated`` unless these are alike, and those of another number are not.
+
+    By the share of the variance of the logarithms that is between columns: with clouds of KITTI and PandaSet at
+    least 0.34 for the right number, and at most 0.01 for one without a common divisor.
+    """
+    logs, shares = np.empty(0), dict[int, float]()
+    with suppress(OSError):
+        logs = np.log(np.clip(np.abs(np.nan_to_num(np.fromfile(file, "<f4", 8 * _MOST_ROWS))), 1e-3, 1e6))
+    for count in range(3, 9):
+        rows = logs[: len(logs) // count * count].reshape(-1, count)
+        shares[count] = (
+            float(rows.mean(axis=0).var() / max(rows.var(), 1e-12)) if len(rows) >= _FEWEST_ROWS else 0.0
+        )
+    best = next(count for count in shares if shares[count] >= 0.9 * max(shares.values()))
+    return best if shares.get(stated, 1.0) < _ALIKE * shares[best] and shares[best] > _APART else stated
 
 
 def contents_of(

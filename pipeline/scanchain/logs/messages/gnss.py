@@ -29,11 +29,13 @@ def read_fix(message: Any) -> list[Fix]:
 def fix_of(message: Any, at_ns: int, frame: str) -> Fix:
     """The position and covariance of a message.
 
-    Raises MalformedMessageError for a position that is none on Earth.
+    Raises MalformedMessageError for a position that is none on Earth, or unset.
     """
     position = float(message.latitude), float(message.longitude), float(message.altitude)
     if not (abs(position[0]) <= 90.0 and abs(position[1]) <= 360.0 and np.isfinite(position[2])):
         raise MalformedMessageError("its position is none on Earth")
+    if not any(position[:2]):
+        raise MalformedMessageError("its latitude and longitude are 0, as of a receiver without a fix")
     covariance = np.array(message.position_covariance, np.float64)
     is_stated = message.position_covariance_type > 0 and covariance.size == 9 and np.isfinite(covariance).all()
     if not is_stated or np.linalg.eigvalsh(covariance.reshape(3, 3))[0] <= 0.0:

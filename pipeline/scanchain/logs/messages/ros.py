@@ -10,6 +10,7 @@ from scanchain.errors import one_line, printable
 
 # of sensor_msgs/PointField, and 9 and 10 of PCL
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
+_ZSTD = b"\x28\xb5\x2f\xfd"  # with which data compressed by zstd begin
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _GPS = {  # of gps_msgs and gps_common: the types of the fields, each with names
     "GPSStatus": (
@@ -62,7 +63,8 @@ def unpacked(data: memoryview, type_name: str, encoding: str) -> Any:
     try:
         return unpack(data, type_name)
     except SerdeError as error:
-        raise MalformedMessageError(one_line(error)) from error
+        packed_alone = "it is compressed: give the folder of the bag, with its metadata.yaml"
+        raise MalformedMessageError(packed_alone if data[:4] == _ZSTD else one_line(error)) from error
 
 
 def packed(type_name: str, *fields: Any) -> bytes:
