@@ -346,6 +346,17 @@ def test_stamps_and_log_times_of_which_one_is_in_another_unit_are_named(tmp_path
     assert max(spans_s, default=0.0) <= 10.0 * period_s  # else deskewing turns each scan by revolutions
 
 
+@pytest.mark.parametrize(("count", "found"), [(1, "1 scan with the stamp 0"), (3, "3 scans with the stamp 0")])
+def test_scans_without_a_stamp_are_told_and_no_jitter(tmp_path, count, found):
+    unset = range(0, 10 * count, 10)
+    path = write(tmp_path / "a.mcap", drive(stamp=lambda k: -(STAMP_NS + k * STEP_NS) if k in unset else 0))
+    stamps = diagnose(path)["stamps"]
+    assert (stamps.severity, stamps.found) == ("note", found)
+    log = open_log(path)
+    list(log.scans())
+    assert any(f"{count} of 40 scans of /scan with the header stamp 0" in note for note in log.notes)
+
+
 def test_scans_that_are_logged_in_bursts_have_no_gaps_and_those_without_stamps_have(tmp_path):
     late = drive(log=lambda k: (4 - k % 5) * STEP_NS)
     assert diagnose(saved(tmp_path, late))["gaps"].severity == "ok"

@@ -57,6 +57,9 @@ def test_the_folder_of_a_ros_2_bag_and_its_db3_alone_are_logs(tmp_path, plugin, 
     assert_drive(*read_undamaged(folder))
     if (plugin, compression) == ("SQLITE3", "NONE"):
         assert_drive(*read_undamaged(folder / "a.db3"))
+    if compression == "MESSAGE":
+        with pytest.raises(InputError, match="is compressed: give the folder of the bag"):
+            read_undamaged(folder / ("a.db3" if plugin == "SQLITE3" else "a.mcap"))
 
 
 @pytest.mark.parametrize(

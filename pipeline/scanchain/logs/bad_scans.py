@@ -91,7 +91,7 @@ class ScanCounts:
         self.farthest_back_ns = self.begin_ns = 0
         self.publishers: dict[str, _Tally] = {}
         self.jumps_s, self.first_jump = list[float](), ""
-        self.first_complaint, self.odd = "", list[str]()
+        self.first_complaint, self.odd, self.unset = "", list[str](), 0
         self.steps_ns = [(0, 0)]  # steps of header stamp and log time from scan to scan, without jumps
         self._last: Scan | None = None
 
@@ -129,6 +129,7 @@ class ScanCounts:
         self.scans += 1
         self.without_wheels += scan.T_odom_base is None
         self.copies += scan.is_copy
+        self.unset += scan.stamp_ns == 0
         if self._last is not None:
             back_ns = self._last.stamp_ns - scan.stamp_ns
             if scan.clock_jump_s:
@@ -222,6 +223,8 @@ class ScanCounts:
             lines.append(
                 f"{steps} back in the header stamps of {self.topic}, {most}; the order of the log is used"
             )
+        if 0 < self.unset < self.scans - self.bad:
+            lines.append(f"{self._share(self.unset)} with the header stamp 0, as of a driver that starts")
         if 0 < self.repeated <= _MOST_REPEATED * self.scans:
             lines.append(f"{self._share(self.repeated)} with the header stamp of the previous one")
         if self.odometry_topic and self.without_wheels:

@@ -212,6 +212,9 @@ def _stamps(seen: Survey) -> Finding:
         if "jump" in seen.log.jumps[0]:
             effect = "the motion over a jump is unknown: a loop may join the segments; else run them separately"
         return Finding("stamps", Severity.WARNING, "; ".join(seen.log.jumps), effect)
+    if 0 < (unset := seen.stamps_ns.count(0)) < len(seen.stamps_ns):
+        effect = "no wheels and no true pose are paired with them"
+        return Finding("stamps", Severity.NOTE, f"{counted(unset, 'scan')} with the stamp 0", effect)
     back_s = -1e-9 * np.diff(seen.stamps_ns)
     if count := int(np.count_nonzero(back_s > 0.0)):
         found = f"{counted(count, 'step')} back, by up to {back_s.max():.2g} s"
