@@ -98,6 +98,17 @@ def test_a_position_that_is_none_on_earth_or_unset_is_left_out_and_counted(log, 
     assert any("3 malformed messages of /b left out" in line for line in opened.damage)
 
 
+def test_fixes_of_another_clock_are_left_out_and_counted(log, tmp_path):
+    with LogWriter(tmp_path / "late.mcap") as writer:
+        begin_ns = int(scanchain.open_log(log).expected_stamps("/scan")[0])
+        for k in range(5):
+            data = pack_fix(begin_ns - 37_000_000_000, "a", MIDDLE, (1.0,) * 3)
+            writer.append("/b", "sensor_msgs/msg/NavSatFix", data, 0, begin_ns + k * 100_000_000)
+    opened = scanchain.open_log([log, tmp_path / "late.mcap"], gnss_topic="/b")
+    assert not fixes_of(opened)
+    assert any("5 fixes of the GNSS receiver left out: more than 10 s" in note for note in opened.notes)
+
+
 def test_none_leaves_it_unused_of_several_none_is_used_and_another_topic_is_refused(log, tmp_path):
     assert scanchain.open_log(log, gnss_topic="none").gnss is None
     logs = with_fixes(log, tmp_path, (MIDDLE, (1.0, 1.0, 2.0)))

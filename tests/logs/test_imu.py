@@ -29,7 +29,8 @@ def with_more(log, folder, topics, **fields):
     with LogWriter(path) as writer:
         for topic in topics:
             for stamp_ns in begin_ns + STAMPS_NS:
-                data = pack_imu(int(stamp_ns), fields.get("frame", "imu_link"), np.zeros(3), np.zeros(3))
+                shifted_ns = int(stamp_ns) + fields.get("shift_ns", 0)
+                data = pack_imu(shifted_ns, fields.get("frame", "imu_link"), np.zeros(3), np.zeros(3))
                 writer.append(topic, "sensor_msgs/msg/Imu", data, int(stamp_ns))
     return [log, path]
 
@@ -59,6 +60,14 @@ def test_after_a_jump_of_the_clock_scans_have_samples_again(log, tmp_path):
     jumped = next(k for k, scan in enumerate(scans) if scan.clock_jump_s)
     assert all(scan.inertial is not None for scan in scans[jumped + 1 :])
     assert scans[jumped].stamp_ns < scans[jumped - 1].stamp_ns
+
+
+@pytest.mark.parametrize("behind_s", [-37.0, 0.0, 37.0])
+def test_of_an_imu_of_another_clock_no_scan_has_samples_and_a_note_says_so(log, tmp_path, behind_s):
+    parts = with_more(log, tmp_path, ["/b"], shift_ns=-round(1e9 * behind_s))
+    opened = scanchain.open_log(parts, imu_topic="/b")
+    assert all(scan.inertial is None for scan in opened) == bool(behind_s)
+    assert ("no sample of the IMU is of the time of a scan" in str(opened.notes)) == bool(behind_s)
 
 
 def test_none_leaves_it_unused_and_a_topic_that_is_none_is_refused(log):

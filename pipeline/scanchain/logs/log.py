@@ -237,7 +237,7 @@ class Log:
                     others=others,
                     origin=own.origin if own.origin.any() else None,
                     inertial=recorded.inertial(returns),
-                    fixes=recorded.fixes(),
+                    fixes=recorded.fixes(returns),
                 )
                 counts.add(scan)
                 self.scans_with_wheels += T_odom_base is not None

@@ -20,6 +20,8 @@ from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.logs.mounting import Sensor, place_text
 
 NEAREST_NS = 500_000_000  # longest time from a stamp to its sample, and, with its delay added, that a scan waits
+# times from a scan to the sample of an IMU before it, and to a fix, above which they are of another clock
+_LONG_BEFORE_NS, _FAR_NS = 2 * NEAREST_NS, 20 * NEAREST_NS
 HOLD_SCANS = 32  # largest number of scans that wait for samples, or for points of other lidars; limits memory
 
 
@@ -131,7 +133,8 @@ class Recorded:
         self.T_lidar_imu, T_lidar_gnss = (None if T is None else upright @ T for T in stated)
         self.antenna_m = None if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
         self._fixes = list[Fix]()  # those since the last scan
-        self._given_ns = 0  # stamp of the last sample that a scan has
+        self._fixed_ns, self._far = 0, 0  # end of the last scan, and number of fixes that are far from it
+        self._given_ns, self._has_imu = 0, imu is not None  # stamp of the last sample that a scan has
         named = {odometry_topic: self.odometry, "" if imu is None else imu.topic: self.imu}
         self.streams: dict[str, SampleStream[Any]] = {topic: stream for topic, stream in named.items() if topic}
         self.ground_truth_topic = ground_truth_topic
@@ -169,21 +172,30 @@ class Recorded:
         return None if is_late and not self.odometry.covers(stamp_ns) else self.odometry.at(stamp_ns)
 
     def inertial(self, returns: Returns) -> Inertial | None:
-        """Samples of the IMU since those of the scan before, to the first after this one; None without any."""
+        """Samples of the IMU since those of the scan before, to the first after this one.
+
+        None without any, and if all are long before, as of another clock.
+        """
         if returns.end_ns < self._given_ns - NEAREST_NS:  # the clock jumped back
             self._given_ns = 0
         after = self.imu.between(max(self._given_ns, returns.end_ns) + 1, returns.end_ns + NEAREST_NS)[:1]
         found = self.imu.between(self._given_ns + 1, returns.end_ns) + after
-        if not found:
+        if not found or found[-1].stamp_ns < returns.end_ns - _LONG_BEFORE_NS:
             return None
         self._given_ns = found[-1].stamp_ns
         stamps_ns = np.array([each.stamp_ns for each in found], np.int64)
         rates, accelerations = np.array([(each.rates, each.accelerations) for each in found]).swapaxes(0, 1)
         return Inertial(stamps_ns, rates, accelerations, self.T_lidar_imu)
 
-    def fixes(self) -> Fixes | None:
-        """The fixes of the GNSS receiver since the scan before; None without any."""
-        found, self._fixes = self._fixes, []
+    def fixes(self, returns: Returns) -> Fixes | None:
+        """The fixes of the GNSS receiver since the scan before; None without any.
+
+        Those far from both scans, as of another clock, are counted.
+        """
+        first_ns, last_ns = sorted((self._fixed_ns or returns.end_ns, returns.end_ns))
+        found = [each for each in self._fixes if first_ns - _FAR_NS <= each.stamp_ns <= last_ns + _FAR_NS]
+        self._far += len(self._fixes) - len(found)
+        self._fixes, self._fixed_ns = [], returns.end_ns
         if not found:
             return None
         stamps_ns, _, positions, covariances = zip(*found, strict=True)
@@ -202,14 +214,20 @@ class Recorded:
         return Trajectory(stamps_ns, np.array([T if T_child is None else T @ T_child for T, T_child in poses]))
 
     def notes(self) -> list[str]:
-        """Notes on a ground truth of other frames than the lidar's."""
+        """Notes on a ground truth of other frames than the lidar's, and on sensors of another clock."""
         used = "taken as the lidar's, as no transform states where it is on"
         done = {
             child: f"{used} {child}" if T is None else f"moved to the lidar, at {place_text(T)}"
             for child, T in self._frames.items()
             if T is None or not np.array_equal(T, np.eye(len(T)))
         }
-        return [f"{self.ground_truth_topic}: poses of {child}, {how}" for child, how in done.items()]
+        notes = [f"{self.ground_truth_topic}: poses of {child}, {how}" for child, how in done.items()]
+        if self._has_imu and not self._given_ns:
+            notes.append("no sample of the IMU is of the time of a scan, as of another clock: it is not used")
+        if self._far:
+            far = f"{counted(self._far, 'fix', 'fixes')} of the GNSS receiver left out"
+            notes.append(f"{far}: more than {1e-9 * _FAR_NS:g} s from the scans, as of another clock")
+        return notes
 
     def losses(self) -> list[str]:
         """Warning for each topic with malformed messages."""
