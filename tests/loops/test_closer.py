@@ -15,7 +15,8 @@ from scanchain.slam import Slam
 from tests.benchmarks.harness import ate_m
 from tests.benchmarks.loops import is_true, true_poses
 from tests.support.drifting import drifting_slam, stretched
-from tests.support.graphs import graph_of
+from tests.support.graphs import chained, graph_of
+from tests.support.matching import Assumed
 from tests.support.scenes import configured, shared_data, square, stored
 
 
@@ -73,6 +74,76 @@ def test_at_a_pose_in_a_map_the_newest_keyframe_is_closed_to_it_and_away_from_it
     assert closer_.near.in_map_at(lie.pose_2d(3.6, 0.0, 0.0), keyframes) == ()
 
 
+def closed(near, keyframes, sigma_m=1e-3):
+    """Closures of the newest keyframe."""
+    return near.close(keyframes, chained(keyframes, sigma_m), np.ones(len(keyframes), bool))
+
+
+def test_a_keyframe_is_aligned_to_what_was_seen_long_before_it_alone():
+    keyframes = keyframes_along(ALONG)
+    keyframes[3] = replace(keyframes[3], stored=stored(square(9.0)))  # 9 m before, but in the window of the submap
+    near = LoopCloser(configured(2), 2).near
+    near.verifier = Assumed(is_accepted=True)
+    closed(near, keyframes)
+    (submap,) = near.verifier.submaps
+    assert np.ptp(submap.points(), axis=0) == pytest.approx([8.0, 8.0], abs=0.1)
+
+
+class Searching:
+    """A finder that keeps what is searched for within the drift, and finds nothing."""
+
+    def __init__(self):
+        self.found = []
+
+    def within_drift(self, path, old, T_world, *, near, radius_m):
+        self.found.append(([each.index for each in path], radius_m))
+
+
+def test_in_a_map_the_path_of_the_log_is_searched_for_within_all_of_the_drift_and_again_after_a_fifth_of_it():
+    keyframes = keyframes_along([*((0.5 * k, 0.5 * k) for k in range(11)), *((5.0, 90.0 + k) for k in range(9))])
+    near, counts = LoopCloser(configured(2), 2).near, []
+    near.of_map, near.verifier, near.finder = 11, Assumed(is_accepted=False), Searching()
+    for count in range(12, 21):
+        before = len(near.finder.found)
+        closed(near, keyframes[:count], 1.0)
+        counts += [count] * (len(near.finder.found) - before)
+    paths, radii_m = zip(*near.finder.found, strict=True)
+    assert counts == [12, 16, 20] and paths == ([11], [*range(11, 16)], [*range(15, 20)])
+    assert radii_m == pytest.approx(
+        [11.0 * np.sqrt(2.0), 20.0, 20.0], abs=0.01
+    )  # to the first keyframe, and at most
+
+
+def test_a_log_in_a_map_is_closed_to_the_map_even_where_its_own_path_is_nearer():
+    keyframes = keyframes_along([*((0.5 * k, 0.5 * k) for k in range(10)), (2.8, 80.0), (4.0, 95.0), (2.8, 110.0)])
+    near = LoopCloser(configured(2), 2).near
+    near.of_map = 10
+    (closure,) = closed(near, keyframes)
+    assert (closure.target, closure.verdict) == (5, ClosureVerdict.ACCEPTED)
+
+
+@pytest.mark.parametrize(("scale", "targets"), [(1.0, [15, 15, 10]), (0.5, [15, 10, 10])])
+def test_in_space_the_submap_of_a_map_stays_the_target_for_ten_meters_unless_it_is_searched_again(scale, targets):
+    """Submaps of a map lie 10 m apart; a log goes back along it."""
+    cloud = stored(np.random.default_rng(0).normal(size=(50, 3)))
+    mapped = [
+        Keyframe(k, k, k, cloud, lie.lift(lie.pose_2d(2.0 * k, 0.0, 0.0)), 2.0 * k, scale) for k in range(31)
+    ]
+    closer_ = LoopCloser(configured(3, {"loops.enabled": False}), 3)
+    closer_.add_map(mapped)
+    closer_.near.verifier = Assumed(is_accepted=True)
+
+    def target(x_m):
+        newest = Keyframe(31, 31, 31, cloud, lie.lift(lie.pose_2d(x_m, 0.0, 0.0)), 200.0, scale)
+        (closure,) = closed(closer_.near, [*mapped, newest], 10.0)
+        return closure.target
+
+    assert [target(x_m) for x_m in (31.0, 22.0, 19.5)] == targets
+    assert target(31.0) == 15
+    closer_.search_again()
+    assert target(22.0) == 10
+
+
 def run(longer, turn_rad_m):
     log = open_log(shared_data("2d/mit_csail.mcap"))
     slam = drifting_slam(configured(2), log.T_base_lidar, stretched(longer, turn_rad_m))
@@ -103,8 +174,9 @@ def test_drift_is_closed_to_a_fifth_and_no_loop_is_wrong(undrifted, longer, turn
 
 
 @pytest.mark.parametrize(
-    ("dimension", "target", "closest"),  # in its pass; in the first one; too far along it; none was matched; in 2D
-    [(3, 40, 45), (3, 5, 15), (3, 0, 75), (3, -1, 75), (2, 40, 15), (2, -1, 15)],
+    # in its pass, ahead or behind; in the first one; too far ahead, or behind; none was matched; in 2D
+    ("dimension", "target", "closest"),
+    [(3, 40, 45), (3, 55, 45), (3, 5, 15), (3, 0, 75), (3, 58, 75), (3, -1, 75), (2, 40, 15), (2, -1, 15)],
 )
 def test_a_revisit_stays_with_the_pass_that_was_matched_last_and_in_the_plane_with_the_first(
     monkeypatch, dimension, target, closest

@@ -15,10 +15,14 @@ from scanchain.data import ClosureVerdict, Keyframe, Proposal
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.loops import LoopCloser
+from scanchain.loops.recognizer import Candidate
+from scanchain.loops.submaps import submap_around
 from scanchain.runs.directory import POINTS_FILE
 from scanchain.slam import Slam
+from tests.support.graphs import chained
 from tests.support.killing import taken_up
-from tests.support.scenes import configured, shared_data
+from tests.support.matching import Assumed
+from tests.support.scenes import configured, shared_data, stored
 from tests.support.town import graph_of, passage, pose, street
 
 RECOGNIZER = '''
@@ -187,3 +191,84 @@ def test_a_place_is_refused_that_odometry_cannot_have_missed_by_so_much(monkeypa
         keyframes, graph_of(keyframes, sigma_rad), np.ones(len(keyframes), bool), finish=True
     )
     assert closures and all("of the path between" in closure.reason for closure in closures) == are_refused
+
+
+class Proposing:
+    """A recognizer whose candidates are given; it keeps the submaps and the queries."""
+
+    def __init__(self, propose=lambda query: []):
+        self.propose, self.anchors, self.queries = propose, [], []
+
+    def add(self, submap):
+        self.anchors.append(submap.anchor)
+
+    def query(self, query):
+        self.queries.append(query)
+        return self.propose(query)
+
+
+LINE = [
+    Keyframe(k, k, k, stored(np.eye(2)), lie.pose_2d(2.0 * k, 0.0, 0.0), 2.0 * k) for k in range(60)
+]  # a keyframe each 2 m; submaps have a radius of 10 m
+
+
+def proposed(recognizer, is_connected=True, keyframes=LINE):
+    """Closures with what a recognizer proposes, each verified as it is; the first half may be another segment."""
+    places = LoopCloser(configured(2), 2).places
+    places.recognizer, places.verifier = recognizer, Assumed(is_accepted=True)
+    connected = np.arange(len(keyframes)) >= (0 if is_connected else 30)
+    return places.close(keyframes, chained(keyframes, 0.01), connected, finish=True)
+
+
+def test_submaps_lie_a_third_of_their_radius_apart_and_none_is_sought_where_it_shares_scans():
+    recognizer = Proposing()
+    proposed(recognizer)
+    assert np.diff([each.traveled_m for each in recognizer.anchors]).tolist() == [4.0] * 29
+    segments, old = LoopCloser(configured(2), 2).segments, [each.traveled_m for each in LINE]
+    last = [np.searchsorted(old, query.max_traveled_m, side="right") - 1 for query in recognizer.queries]
+    assert max(last) == 43
+    for query, newest in zip(recognizer.queries, last, strict=True):
+        for k in range(newest + 1):
+            members = submap_around(LINE, k, query.submap.radius_m, segments).members
+            assert members[-1].index < query.submap.members[0].index
+
+
+def test_a_pose_is_expected_by_odometry_since_the_last_closure_before_the_graph_is_corrected():
+    T_target_source = lie.pose_2d(40.5, 0.3, 0.1)
+    recognizer = Proposing(lambda query: [Candidate(0, T_target_source, 1.0)][: query.submap.anchor.index == 20])
+    (closure,) = proposed(recognizer)
+    assert closure.verdict is ClosureVerdict.ACCEPTED
+    expected = [query.T_world_anchor for query in recognizer.queries]
+    since = [T_target_source @ lie.pose_2d(2.0 * k - 40.0, 0.0, 0.0) for k in range(22, 60, 2)]
+    np.testing.assert_allclose(expected[:11], [each.T_odom_lidar for each in LINE[:22:2]], atol=1e-12)
+    np.testing.assert_allclose(expected[11:], since, atol=1e-12)
+
+
+AHEAD, FAR = lie.pose_2d(100.0, 0.0, 0.0), lie.pose_2d(50.0, 0.0, 0.0)  # as odometry has it, and not
+
+
+@pytest.mark.parametrize(
+    ("T", "options", "is_connected", "verdict"),
+    [
+        (AHEAD, {}, True, "verified by matching"),
+        (AHEAD, {"rival": 7}, True, "another keyframe is as similar"),
+        (FAR, {}, True, "far from the prediction"),
+        (FAR, {}, False, "verified by matching"),  # odometry does not connect them
+        (AHEAD, {"proposed_by": Proposal.POSITION}, True, "verified by matching"),
+        (AHEAD, {"proposed_by": Proposal.POSITION}, False, None),  # it was not expected there
+    ],
+)
+def test_a_candidate_is_accepted_where_it_has_no_rival_and_odometry_allows_it(T, options, is_connected, verdict):
+    recognizer = Proposing(lambda query: [Candidate(0, T, 1.0, **options)][: query.submap.anchor.index == 50])
+    closures = proposed(recognizer, is_connected)
+    assert [closure.cause for closure in closures] == [verdict] * (verdict is not None)
+
+
+def test_the_first_keyframe_of_a_log_may_be_recognized_in_all_of_a_map():
+    places = LoopCloser(configured(2), 2).places
+    places.recognizer = Proposing()
+    start_m = places.add_map(LINE)
+    keyframes = [*LINE, Keyframe(60, 60, 60, LINE[0].stored, lie.identity(2), start_m)]
+    places.close(keyframes, chained(keyframes, 0.01), np.ones(61, bool), finish=True)
+    (query,) = places.recognizer.queries
+    assert query.max_traveled_m >= LINE[-1].traveled_m

@@ -1,5 +1,7 @@
 """Pose graphs for tests: published ones, of given poses and edges, and rings."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -29,6 +31,13 @@ def graph_of(poses, edges=(), measurements=(), information=None, is_loop=None, s
         loops = np.zeros(count, bool) if is_loop is None else np.asarray(is_loop)
         graph.add_edges(np.asarray(edges), np.asarray(measurements), every, loops)
     return graph
+
+
+def chained(keyframes, sigma_m):
+    """The graph of the odometry of keyframes, each of whose motions has so much noise."""
+    poses, edges = np.array([each.T_odom_lidar for each in keyframes]), [*pairwise(range(len(keyframes)))]
+    information = np.diag(lie.by_component(lie.twist_size(poses[0]), sigma_m, 1e-3) ** -2.0)
+    return graph_of(poses, edges, lie.between(poses[:-1], poses[1:]), information)
 
 
 def ring(dimension, count=12, *, noise=0.0, seed=0):
