@@ -6,26 +6,29 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.data import ClosureVerdict, Proposal
+from scanchain.data import ClosureVerdict, Keyframe, Proposal
 from scanchain.loops import LoopCloser, outline_of
+from scanchain.loops.place_search import completed
 from scanchain.loops.recognizer import Query
 from scanchain.loops.upright_search import PLACES_FILE, OutlineRecognizer, UprightMap
-from tests.support.scenes import configured
-from tests.support.town import graph_of, passage, place_in_the_middle, pose, street
+from tests.support.scenes import configured, stored
+from tests.support.town import blocked, graph_of, passage, place_in_the_middle, pose, street
+
+LEVEL = lie.identity(3)
 
 
-def proposed(first, second, T_first_second):
+def proposed(first, second, T_first_second, T_world_first=LEVEL):
     """Candidates for a submap, passed 500 m after another one, which it is expected at this pose of."""
     recognizer = OutlineRecognizer(configured(3), 3)
     anchors = [replace(each.anchor, index=k, traveled_m=500.0 * k) for k, each in enumerate((first, second))]
     for anchor, each in zip(anchors, (first, second), strict=True):
         recognizer.add(replace(each, anchor=anchor))
-    T_world = np.array([lie.identity(3), T_first_second])
-    return recognizer.query(Query(replace(second, anchor=anchors[1]), 100.0, T_first_second, anchors, T_world))
+    T_world = T_world_first @ np.array([lie.identity(3), T_first_second])
+    return recognizer.query(Query(replace(second, anchor=anchors[1]), 100.0, T_world[1], anchors, T_world))
 
 
 @pytest.mark.parametrize(("offset_m", "backwards"), [(0.0, False), (4.0, False), (4.0, True), (0.0, True)])
-@pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (9.0, -6.0, 0.1), (-25.0, 30.0, -0.3)])
+@pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (9.0, -6.0, 0.1), (-25.0, 30.0, -0.3), (5.0, 0.0, 0.45)])
 def test_a_place_is_known_again_from_the_other_lane_and_the_other_way(offset_m, backwards, off):
     first, second = place_in_the_middle(), place_in_the_middle(offset_m, backwards)
     truth = lie.inverse(first.anchor.T_odom_lidar) @ second.anchor.T_odom_lidar
@@ -41,6 +44,24 @@ def test_a_place_farther_off_than_odometry_drifts_is_not_proposed():
     first, second = place_in_the_middle(), place_in_the_middle(4.0)
     assert proposed(first, second, pose(150.0, 0.0)) == []
     assert proposed(first, second, pose(yaw=2.0)) == []
+
+
+def test_a_place_is_known_again_in_a_world_that_is_not_level():
+    first, second = place_in_the_middle(), place_in_the_middle(4.0)
+    truth = lie.between(first.anchor.T_odom_lidar, second.anchor.T_odom_lidar)
+    best = proposed(first, second, truth, pose(pitch=0.6))[0]
+    assert lie.apart(best.T_target_source, truth)[0] < 1.0 and best.score > 0.5
+
+
+@pytest.mark.parametrize("off_m", [0.0, 40.0])
+def test_far_from_the_expected_pose_a_place_that_is_also_elsewhere_is_ambiguous(off_m):
+    here, recognizer = place_in_the_middle(), OutlineRecognizer(configured(3), 3)
+    anchors = [replace(here.anchor, index=k, traveled_m=500.0 * k) for k in range(3)]
+    for anchor in anchors:
+        recognizer.add(replace(here, anchor=anchor))
+    T_world = np.array([pose(), pose(60.0, 40.0), pose(off_m)])
+    best = recognizer.query(Query(replace(here, anchor=anchors[2]), 500.0, T_world[2], anchors, T_world))[0]
+    assert best.score > 0.9 and best.rival == (1 - best.target if off_m else -1)
 
 
 # --- in a map, from nowhere --------------------------------------------------------------------------------------
@@ -125,6 +146,36 @@ def test_of_two_places_that_are_the_same_none_is_said_to_be_it(tmp_path):
     assert reasons == {"another location in the map is as similar"}
     assert UprightMap([*there, *again], configured(3)).is_repeated(there[1:11])
     assert not UprightMap(there, configured(3)).is_repeated(there[1:11])
+
+
+@pytest.mark.parametrize(("count", "width_m", "verdict"), [(30, 5.0, "accepted"), (30, 10.0, "rejected")])
+def test_a_map_of_another_day_may_differ_but_not_in_most_of_what_it_shows(count, width_m, verdict):
+    log = blocked(passage(street(4.0, True)[4:8]), count, width_m)
+    closure = completed(UprightMap(passage(street()), configured(3)).found(log))
+    assert closure.verdict.value == verdict
+
+
+def test_a_level_pose_is_on_the_ground_of_the_nearest_keyframe_of_each_story():
+    """A lidar 2 m above the ground of a valley, whose sides fall and rise by 1 in 5, and 4 m above that again."""
+    x, y = np.random.default_rng(0).uniform(-15.0, 15.0, (2, 20_000))
+    keyframes = []
+    for k, (x_m, z_m, slope) in enumerate(
+        [(-20.0, 4.0, -0.2), (20.0, 4.0, 0.2), (-20.0, 8.0, -0.2), (20.0, 8.0, 0.2)]
+    ):
+        cloud = stored(np.column_stack([x, y, slope * x - 2.0]))
+        keyframes.append(Keyframe(k, k, k, cloud, pose(x_m, 0.0, z_m), 40.0 * k))
+    valley = UprightMap(keyframes, configured(3))
+    at = lie.pose_2d(-16.0, 3.0, 0.7)
+    assert [valley.stories(at[:2, 2]), valley.stories(np.array([20.0, 1.0])), valley.stories(np.zeros(2))] == [
+        [0, 2],
+        [1, 3],
+        [],
+    ]
+    for k, z_m in ((0, 3.2), (2, 7.2)):
+        T = keyframes[k].T_odom_lidar @ valley.on_ground(k, at)
+        np.testing.assert_allclose(T[:3, 3], [-16.0, 3.0, z_m], atol=0.02)
+        np.testing.assert_allclose(T[:3, 2], np.array([0.2, 0.0, 1.0]) / np.hypot(0.2, 1.0), atol=0.01)
+        assert np.arctan2(T[1, 0], T[0, 0]) == pytest.approx(0.7, abs=0.02)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])

@@ -1,21 +1,25 @@
 """Verification of proposed closures: submaps that agree or do not, and free space that contradicts a match."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scanchain import lie
 from scanchain.data import ClosureVerdict, Keyframe, Problem
+from scanchain.loops.connectivity import Segments
+from scanchain.loops.submaps import Submap, submap_around
 from scanchain.loops.verification import Verifier, free_space_agreement
 from scanchain.registration import VoxelMap
 from tests.support.scenes import configured, square, stored
-from tests.support.town import place_in_the_middle, pose
+from tests.support.town import blocked, passage, place_in_the_middle, pose, street
 
 
 def test_submaps_of_one_place_agree_and_those_of_two_do_not():
     here = place_in_the_middle()
     again = place_in_the_middle(4.0, True)
     truth = lie.inverse(here.anchor.T_odom_lidar) @ again.anchor.T_odom_lidar
-    true = Verifier(configured(3)).submap(again, here, truth @ pose(1.0, -0.8, yaw=0.06))
+    true = Verifier(configured(3)).submap(again, here, truth @ pose(2.0, -0.8, yaw=0.06))
     error = lie.inverse(truth) @ true.match.T_target_source
     assert true.match.converged and true.overlap > 0.6 and true.agreement > 0.9
     assert np.linalg.norm(error[:3, 3]) < 0.1 and lie.rotation_angle(error) < 0.005
@@ -36,6 +40,36 @@ def test_submaps_that_agree_too_little_about_free_space_are_rejected():
     found = Verifier(configured(3)).submap(here, here, lie.identity(3), min_agreement=1.1)
     assert found.agreement == pytest.approx(1.0, abs=0.02)
     assert found.problem.cause == "free-space agreement < the limit for a recognized place (1.1)"
+
+
+def cause_between(source, target):
+    """The cause for which the true alignment of two submaps is rejected, without its limit; None if accepted."""
+    true = lie.between(target.anchor.T_odom_lidar, source.anchor.T_odom_lidar)
+    found = Verifier(configured(3)).submap(source, target, true)
+    return found.problem and found.problem.cause.partition(" < ")[0]
+
+
+@pytest.mark.parametrize(("panels", "cause"), [(20, None), (30, "free-space agreement")])
+def test_what_blocks_a_street_that_was_seen_free_rejects_a_place_that_fits(panels, cause):
+    here = place_in_the_middle()
+    there = replace(here, members=blocked(here.members, panels))
+    assert cause_between(there, here) == cause_between(here, there) == cause
+
+
+@pytest.mark.parametrize(("radius_m", "other", "cause"), [(15.0, 5, None), (10.0, 11, "overlap")])
+def test_submaps_of_places_apart_are_a_closure_where_they_share_two_fifths(radius_m, other, cause):
+    keyframes = passage(street())
+    source, target = (submap_around(keyframes, k, radius_m, Segments()) for k in (other, 8))
+    assert cause_between(source, target) == cause
+
+
+def test_a_place_that_is_the_same_all_along_is_rejected_however_well_it_fits():
+    rng, along = np.random.default_rng(0), np.random.default_rng(1).uniform(-20.0, 20.0, 9000)
+    ground = np.column_stack([along, rng.uniform(-4.0, 4.0, 9000), np.full(9000, -1.7)])
+    walls = np.column_stack([along, np.where(along * 1e3 % 2.0 < 1.0, 4.0, -4.0), rng.uniform(-1.7, 3.0, 9000)])
+    keyframe = Keyframe(0, 0, 0, stored(np.vstack([ground, walls])), lie.identity(3), 0.0)
+    corridor = Submap(keyframe, [keyframe], 18.0)
+    assert cause_between(corridor, corridor) == "information"
 
 
 def verified(points, changes=None, **options):

@@ -1,5 +1,6 @@
 """Keyframes of a lidar along streets of the simulated town, and graphs of their odometry."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -70,6 +71,18 @@ def place_in_the_middle(offset_m=0.0, backwards=False):
     """Submap around the middle of that drive."""
     keyframes = passage(street(offset_m, backwards))
     return submap_around(keyframes, len(keyframes) // 2, RADIUS_M, Segments())
+
+
+def blocked(keyframes, count, width_m=5.0):
+    """The same keyframes, which also see so many panels across the street, evenly along it, 4 m high."""
+    y, z = np.meshgrid(np.arange(-0.5 * width_m, 0.5 * width_m, 0.25), np.arange(0.0, 3.5, 0.25))
+    x = 22.0 + 58.0 * (np.arange(count) + 0.5) / count
+    panels = np.concatenate([np.column_stack([np.full(y.size, each), y.ravel() - 2.0, z.ravel()]) for each in x])
+    seen = (lie.transform(lie.inverse(each.T_odom_lidar), panels) for each in keyframes)
+    return [
+        replace(each, stored=stored(np.vstack([each.points, points[np.linalg.norm(points, axis=1) < 30.0]])))
+        for each, points in zip(keyframes, seen, strict=True)
+    ]
 
 
 def graph_of(keyframes, sigma_rad=0.002):
