@@ -77,6 +77,16 @@ def test_keyframes_closer_than_a_meter_count_for_the_path_between_them():
     assert [each - FOUND[2] for each in odds] == pytest.approx([4.0, 2.5])
 
 
+def test_keyframes_count_for_the_path_to_the_nearest_other_one_in_whatever_order_they_are_matched():
+    keyframes = keyframes_in([4.0] * 4)
+    at_m = {3: 3.0, 4: 9.0, 5: 3.25, 6: 6.0}  # where the fourth was not matched yet when the others were
+    keyframes = [replace(each, traveled_m=at_m.get(each.index, 0.0)) for each in keyframes]
+    for order, weights in (((3, 4, 5, 6), 3.25), ((6, 5, 4, 3), 3.25), ((4, 6, 3), 3.0)):
+        evidence, _ = begun()
+        evidence.update(tried(*order), keyframes, np.array([each.T_odom_lidar for each in keyframes]))
+        assert evidence.log_odds - FOUND[2] == pytest.approx(weights * LARGEST_RATIO)
+
+
 def test_the_longer_the_path_that_was_sought_the_more_a_place_has_to_show():
     keyframes = [replace(each, traveled_m=20.0 * each.index) for each in keyframes_in([4.0] * 8)]
     evidence, _ = begun()
@@ -97,6 +107,28 @@ def test_what_is_joined_is_withdrawn_once_the_place_is_seen_through_and_not_befo
     assert not evidence.is_testing
     holds = [evidence.update_joined(tried(source), *up_to(source, keyframes)) for source in range(9, 21)]
     assert holds[0] and holds[3] and not holds[-1]
+
+
+def test_a_place_that_was_right_for_long_is_withdrawn_as_soon_as_one_that_was_right_for_a_while():
+    keyframes = keyframes_in([4.0] * 40 + [9.0] * 12)
+    evidence, _ = begun()
+    for source in range(3, 7):
+        evidence.update(tried(source), *up_to(source, keyframes))
+    holds = [evidence.update_joined(tried(source), *up_to(source, keyframes)) for source in range(7, 55)]
+    assert all(holds[:40]) and holds.index(False) < 46  # 36 of them match
+
+
+def test_keyframes_far_from_the_last_match_do_not_count():
+    keyframes = keyframes_in([4.0] * 3 + [9.0] * 3)
+    keyframes = [replace(each, traveled_m=20.0 * each.index) for each in keyframes]
+    evidence, _ = begun()
+    evidence.update(tried(3, 4, 5), *up_to(5, keyframes))
+    odds = [evidence.log_odds]
+    for source in range(6, 9):
+        closures = tried(source, overlap=0.1, verdict=ClosureVerdict.REJECTED)
+        evidence.update_joined(closures, *up_to(source, keyframes))
+        odds.append(evidence.log_odds)
+    assert odds[0] > odds[1] > odds[2] == odds[3]
 
 
 def test_another_pose_is_taken_once_more_keyframes_match_there_than_at_the_first():
@@ -163,8 +195,11 @@ def test_within_one_log_fewer_keyframes_pass_at_their_final_poses_and_another_pl
     evidence, other = begun()[0], begun()[0]
     other.record(tried(3, 4, 5))
     evidence.continue_from(other)
-    passes = [evidence.passes_at(range(3, 6), *up_to(5, keyframes), of_same_log=same) for same in (True, False)]
-    assert passes == [True, False] and not begun()[0].passes_at(
+    passes = [
+        evidence.passes_at(range(3, end), *up_to(5, keyframes), of_same_log=same)
+        for end, same in ((6, True), (6, False), (5, True))
+    ]
+    assert passes == [True, False, False] and not begun()[0].passes_at(
         range(3, 6), *up_to(5, keyframes), of_same_log=True
     )
 

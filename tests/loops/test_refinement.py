@@ -1,4 +1,4 @@
-"""All scans of a planar log aligned to the map of the keyframes at the end."""
+"""All scans at the end: corrected as their keyframes; in the plane, each aligned to the map of all keyframes."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from scanchain import Slam, lie
 from scanchain.data import Keyframe, Scan
 from scanchain.kernels.registration.icp import refine
-from scanchain.loops import refined
+from scanchain.loops import refined, spread
 from scanchain.point_store import PointStore
 from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
@@ -47,6 +47,24 @@ def error_m(poses, truth):
     return np.sqrt(np.mean((poses - truth)[:, :2, 2] ** 2))
 
 
+def test_scans_share_the_corrections_of_the_keyframes_around_them_but_not_over_an_unknown_motion(dimension):
+    rng, k = np.random.default_rng(0), 3 * dimension - 3
+    odometry, keyframes = lie.exp(rng.normal(size=(20, k))), np.array([0, 5, 10, 17])
+    ahead = np.eye(k)[0]
+    shifted = odometry[keyframes] @ lie.exp(
+        np.array([0.0, 0.0, 0.5, 0.5])[:, None] * ahead
+    )  # half a meter on, from the third
+    for starts, moved_m in (((), [0, 0, 0, 0, 0, 0, 0.1, 0.2, 0.3, 0.4]), ((2,), [0.0] * 10)):
+        world = lie.exp(rng.normal(size=k))
+        found = spread(world @ shifted, keyframes, odometry, starts)
+        np.testing.assert_allclose(found[keyframes], world @ shifted, atol=1e-9)
+        off_m = np.linalg.norm((lie.inverse(world) @ found - odometry)[:, :-1, -1], axis=1)
+        np.testing.assert_allclose(off_m[:10], moved_m, atol=1e-9)
+        np.testing.assert_allclose(
+            lie.between(found[17:18], found[17:]), lie.between(odometry[17:18], odometry[17:])
+        )
+
+
 def test_scans_find_the_place_that_the_keyframes_give_them():
     truth, scans, keyframes = drive()
     poses = shaken(truth, 0.03, 0.005)
@@ -62,6 +80,15 @@ def test_a_scan_stays_where_the_map_tells_nothing():
     after = refined(poses, scans.__getitem__, keyframes, poses[::5], configured(2))
     assert abs(after[7, 1, 2] - truth[7, 1, 2]) < 0.005
     assert abs(after[8, 0, 2] - poses[8, 0, 2]) < 0.5 * 0.03
+    assert np.abs(after - poses)[:, 0, 2].max() < 0.025  # along the corridor, of any scan
+
+
+def test_scans_are_aligned_in_coordinates_of_a_country_as_around_the_origin():
+    truth, scans, keyframes = drive()
+    poses, moved = shaken(truth, 0.03, 0.005), shaken(truth, 0.03, 0.005)
+    moved[:, :2, 2] += (400_000.0, 5_400_000.0)
+    found = [refined(each, scans.__getitem__, keyframes, each[::5], configured(2)) for each in (poses, moved)]
+    np.testing.assert_allclose(found[1][:, :2, 2] - (400_000.0, 5_400_000.0), found[0][:, :2, 2], atol=1e-5)
 
 
 def test_a_scan_without_points_or_far_from_everything_stays():
