@@ -51,18 +51,16 @@ def test_scans_share_the_corrections_of_the_keyframes_around_them_but_not_over_a
     rng, k = np.random.default_rng(0), 3 * dimension - 3
     odometry, keyframes = lie.exp(rng.normal(size=(20, k))), np.array([0, 5, 10, 17])
     ahead = np.eye(k)[0]
-    shifted = odometry[keyframes] @ lie.exp(
-        np.array([0.0, 0.0, 0.5, 0.5])[:, None] * ahead
-    )  # half a meter on, from the third
+    more_m = np.array([0.0, 0.0, 0.5, 0.5])
+    shifted = odometry[keyframes] @ lie.exp(more_m[:, None] * ahead)
     for starts, moved_m in (((), [0, 0, 0, 0, 0, 0, 0.1, 0.2, 0.3, 0.4]), ((2,), [0.0] * 10)):
         world = lie.exp(rng.normal(size=k))
         found = spread(world @ shifted, keyframes, odometry, starts)
         np.testing.assert_allclose(found[keyframes], world @ shifted, atol=1e-9)
         off_m = np.linalg.norm((lie.inverse(world) @ found - odometry)[:, :-1, -1], axis=1)
         np.testing.assert_allclose(off_m[:10], moved_m, atol=1e-9)
-        np.testing.assert_allclose(
-            lie.between(found[17:18], found[17:]), lie.between(odometry[17:18], odometry[17:])
-        )
+        after_last = [lie.between(each[17:18], each[17:]) for each in (found, odometry)]
+        np.testing.assert_allclose(*after_last, atol=1e-9)
 
 
 def test_scans_find_the_place_that_the_keyframes_give_them():
