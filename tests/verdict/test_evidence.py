@@ -80,6 +80,12 @@ def test_another_sensor_confirms_scans_where_it_agrees_and_parts_most_of_which_i
     assert not replace(found, checks=found.checks[:1]).is_confirmed_throughout(slice(0, 100))
 
 
+def test_a_scan_is_contradicted_only_where_its_points_should_determine_its_pose():
+    fit = np.where(marked(100, 399), 0.4, 0.9)
+    found = evidence(fit=fit, is_lost=marked(150, 199), is_degenerate=marked(250, 299))
+    assert np.array_equal(found.is_contradicted, marked(100, 149) | marked(200, 249) | marked(300, 399))
+
+
 def test_a_gap_is_an_interval_of_more_than_three_usual_ones():
     times_s = np.cumsum(np.where(np.arange(50) == 20, 0.62, np.where(np.arange(50) == 30, 0.58, INTERVAL_S)))
     assert np.flatnonzero(evidence(POSES[:50], seconds=times_s).is_after_gap).tolist() == [20]

@@ -89,6 +89,10 @@ FOUND = {
         lambda: evidence(wheels=wheels_of(POSES), inlier_share=shares(0.4, 600)), CHECK, {Kind.OVERLAP},
         "scan 600 (120.0 s): overlap lost",
     ),
+    "a segment that starts where nothing is known": (
+        lambda: evidence(inlier_share=shares(0.4, 600), starts_segment=marked(600, 600)), CHECK,
+        {Kind.DISCONNECTED}, "disconnected",
+    ),
     "a driver that was stuck": (
         lambda: evidence(stuck(), is_copy=marked(501, 520)), WRONG, {Kind.COPIES, Kind.ACCELERATION}, ""
     ),
@@ -142,6 +146,15 @@ def test_a_short_interval_after_a_gap_accelerates_nothing():
 def test_the_smallest_jump_is_the_one_that_is_found(times, is_found):
     poses = chained(np.tile([0.5, 0.0, 0.0], (60, 1)), np.random.default_rng(0))
     poses[30:, 0, 2] += times * smallest_jump_m(TIMES_NS[:61] * 1e-9)
+    innovation = check_velocity(TIMES_NS[:61], TIMES_NS[:61], poses)
+    assert (np.nanmax(innovation) > Velocity.limit) == is_found
+
+
+@pytest.mark.parametrize(("turn_rad", "is_found"), [(0.5, False), (3.0, True)])
+def test_a_turn_that_no_vehicle_makes_is_found_where_it_does_not_move_the_lidar(turn_rad, is_found):
+    motions = np.zeros((60, 3))
+    motions[30, 2] = turn_rad
+    poses = chained(motions, np.random.default_rng(0))
     innovation = check_velocity(TIMES_NS[:61], TIMES_NS[:61], poses)
     assert (np.nanmax(innovation) > Velocity.limit) == is_found
 
