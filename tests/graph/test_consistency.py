@@ -62,6 +62,22 @@ def test_edges_that_join_the_same_segments_with_the_same_mistake_are_a_group_and
     assert [group.tolist() for group in agreeing_groups(problem, true, every, 16.0)] == [[53, 54, 55, 56, 57]]
 
 
+@pytest.mark.parametrize(
+    ("count", "step_m", "sizes"), [(4, 0.03, [4]), (4, 0.3, []), (40, 0.0, [40]), (60, 0.0, [])]
+)
+def test_a_group_differs_by_no_more_than_odometry_between_its_edges_may_and_is_not_too_large(count, step_m, sizes):
+    true = np.array([lie.pose_2d(0.5 * k, 0.0, 0.0) for k in range(200)])
+    chain, loops = [(k, k + 1) for k in range(199)], [(4 * k, 4 * k + 20) for k in range(min(count, 40))]
+    loops += [(k, k + 21) for k in range(count - len(loops))]
+    edges = np.array([*chain, *loops])
+    Z = lie.between(*true[edges.T])
+    Z[199:] = Z[199:] @ lie.exp(np.outer(step_m * np.arange(count), [1.0, 0.0, 0.0]))
+    information = np.where(np.arange(len(edges)) < 199, 1e4, 1e8)[:, None, None] * np.eye(3)
+    problem = graph_of(true, edges, Z, information, np.arange(len(edges)) >= 199)._prepared()
+    groups = agreeing_groups(problem, true, np.ones(len(edges), bool), 16.0)
+    assert [len(group) for group in groups] == sizes
+
+
 def test_a_pose_carried_along_true_poses_is_the_true_one(dimension):
     rng = np.random.default_rng(1)
     true = lie.exp(rng.normal(size=(12, 3 * dimension - 3)))

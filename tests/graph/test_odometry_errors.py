@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.graph.odometry_errors import Explanation, InflatedSegment, corrected, odometry_of
+from scanchain.graph.odometry_errors import Explanation, InflatedSegment, corrected, error_twists, odometry_of
 
 SEGMENTS = (InflatedSegment(2, 4, False), InflatedSegment(7, 1, True))
 
@@ -96,3 +96,19 @@ def test_an_explanation_costs_more_the_larger_the_drift_the_more_segments_and_th
     assert jump > slip + 48.0
     later = Explanation(none.drift, SEGMENTS[:1]).with_later(Explanation(none.drift, SEGMENTS[1:]), 100)
     assert later.inflated == (SEGMENTS[0], InflatedSegment(107, 1, True))
+
+
+@pytest.mark.parametrize(("across", "axis"), [(1.0, 0), (1.0 / 3.0, 1), (3.0, 0)])
+def test_a_slip_is_along_the_motion_unless_another_direction_is_much_less_certain(dimension, across, axis):
+    k = 3 * dimension - 3
+    information = np.diag(lie.by_component(k, 1e4, 1e4))
+    information[1, 1] *= across
+    (twist,) = error_twists(lie.exp(np.eye(k)[:1]), information[None], is_jump=False)
+    np.testing.assert_allclose(np.abs(twist[:, 0]), np.eye(k)[axis], atol=1e-9)
+
+
+def test_what_a_jump_costs_is_scaled_with_the_price_of_a_loop_edge(dimension):
+    _, Z, information = odometry(dimension)
+    jump = Explanation(np.zeros(2 if dimension == 2 else 4), SEGMENTS[1:])
+    whole, half = (jump.cost(Z, information, price, 16.0) for price in (16.0, 8.0))
+    assert half == pytest.approx(0.5 * whole)

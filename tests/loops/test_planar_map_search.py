@@ -105,6 +105,7 @@ def test_in_the_middle_of_a_square_room_the_heading_is_ambiguous():
 def test_a_lidar_is_nowhere_that_the_map_does_not_know():
     x_m = np.arange(-6.0, 6.0, 0.02)
     wall = np.column_stack([x_m, np.random.default_rng(0).uniform(0.0, 2.0, 12)[(x_m + 6.0).astype(int)]])
+    wall = np.vstack([wall, np.tile([[7.0, 9.0]], (9, 1))])  # seen past its end: the map reaches that far
     before, behind = lie.pose_2d(0.0, -3.0, 1.0), lie.pose_2d(0.0, 5.0, -2.0)
     seen_from = [lie.transform(lie.inverse(T), wall) for T in (before, behind)]
     known = PlanarMapSearch([Keyframe(k, k, k, stored(seen_from[0]), before, 0.0) for k in range(2)], 0.1)

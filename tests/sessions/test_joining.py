@@ -7,10 +7,12 @@ import pytest
 
 from scanchain import lie, load_settings
 from scanchain.data import Closure, ClosureVerdict, Keyframe
+from scanchain.loops.connectivity import Segments
+from scanchain.loops.submaps import submap_around
 from scanchain.maps import Edges, SavedPoints
 from scanchain.odometry.odometry import first_match
 from scanchain.sessions.joining import Joined, UncertainJoin, changed, graph_of, join, join_all, objection_to
-from tests.support.rooms import BOX, hall, map_of, part, room
+from tests.support.rooms import BOX, corridor, hall, map_of, part, room
 
 
 def test_keyframes_held_as_one_pose_leave_the_cost_as_it_is(dimension):
@@ -38,13 +40,14 @@ def _room(dimension, half_m):
 
 
 def test_a_map_that_differs_from_those_it_joined_by_more_than_they_do_in_themselves_is_told(dimension):
-    def joined_with(half_m):
-        rooms = [_room(dimension, wide_m) for wide_m in (4.0, 4.0, half_m, half_m)]
+    def joined_with(half_m, others_m=(4.0, 4.0)):
+        rooms = [_room(dimension, wide_m) for wide_m in (*others_m, half_m, half_m)]
         keyframes = tuple(replace(room, index=k, traveled_m=100.0 * k) for k, room in enumerate(rooms))
         return Joined((0, 1), keyframes, np.array([0, 0, 1, 1]), None)
 
     assert changed(joined_with(4.0)) == {}
     assert changed(joined_with(9.0))[1] > 0.3
+    assert changed(joined_with(4.0, (4.0, 9.0))) == {}  # as much differs within a map
 
 
 @pytest.mark.parametrize("repeats", [True, False])
@@ -52,7 +55,7 @@ def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(re
     depths_m = np.random.default_rng(4).uniform(1.0, 3.0, 60)
     if repeats:
         depths_m = np.tile(depths_m[:5], 12)
-    path = [_corridor(float(x_m), index, depths_m) for index, x_m in enumerate(np.arange(20.0, 38.0, 0.5))]
+    path = [corridor(float(x_m), index, depths_m) for index, x_m in enumerate(np.arange(20.0, 38.0, 0.5))]
     count = len(path)
     pairs = np.column_stack([np.arange(count), np.arange(count, 2 * count)])
     eyes = np.tile(np.eye(3), (count, 1, 1))
@@ -68,18 +71,6 @@ def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(re
     assert "short path" in objection_to(few, count, config)
 
 
-def _corridor(x_m, index, depths_m):
-    """A keyframe in a corridor, one wall of which is as far away as said for every meter along it."""
-    angles = np.arange(-np.pi, np.pi, 0.01)
-    directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    ranges_m = np.arange(0.0, 10.0, 0.02)
-    along, across = x_m + ranges_m * directions[:, :1], ranges_m * directions[:, 1:]
-    is_wall = (across < -1.0) | (across > depths_m[np.clip(along, 0.0, 59.9).astype(int)])
-    seen = is_wall.any(axis=1)
-    points = ranges_m[is_wall.argmax(axis=1)][seen, None] * directions[seen]
-    return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
-
-
 @pytest.mark.parametrize("held", [-1, 0])
 def test_maps_of_one_room_join_and_that_of_another_stays_alone(tmp_path, held):
     T_map_room = lie.pose_2d(0.3, 0.2, 0.1), lie.pose_2d(40.0, -7.0, 2.0), lie.identity(2)
@@ -93,6 +84,9 @@ def test_maps_of_one_room_join_and_that_of_another_stays_alone(tmp_path, held):
     assert [each.index for each in both.keyframes] == list(range(18))
     assert np.abs(both.poses - np.concatenate([maps[0].poses, T @ maps[1].poses])).max() < 0.005
     assert np.array_equal(both.poses[:9], maps[0].poses) or held < 0
+    for anchor in range(18):
+        members = submap_around(both.keyframes, anchor, config.loops.place_radius_m, Segments()).members
+        assert {each.index < 9 for each in members} == {anchor < 9}
     assert np.array_equal(
         both.edges.pairs[:16], np.delete(np.column_stack([np.arange(17), np.arange(1, 18)]), 8, 0)
     )

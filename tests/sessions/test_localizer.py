@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from scanchain import InputError, Localizer, lie
-from scanchain.data import Scan
+from scanchain.data import Keyframe, Scan
 from scanchain.maps import open_saved_map
-from scanchain.sessions.localizer import MapState
-from tests.support.rooms import BOX, hall, map_of, part, room, saved
+from scanchain.sessions.changes import Part
+from scanchain.sessions.localizer import MapState, _moved
+from tests.support.rooms import BOX, corridor, hall, map_of, part, room, saved
 
 
 def test_the_localizer_takes_scans_as_a_driver_has_them(tmp_path):
@@ -68,3 +69,26 @@ def test_a_scan_of_which_nothing_matches_is_lost_and_its_pose_is_predicted():
     sigma_m = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in (known, lost)]
     assert sigma_m[0] < 0.02 and sigma_m[1] > 1.0  # as of the edge to a keyframe after a lost scan
     assert lie.apart(lost.T_map_lidar, prior.poses[10])[0] < 0.01
+
+
+def test_a_log_that_leaves_the_map_is_unmatched_then_outside_and_ever_less_certain():
+    depths_m, x_m = np.random.default_rng(4).uniform(1.0, 3.0, 60), np.arange(21.0, 38.0, 0.25)
+    mapped = [corridor(float(x), k, depths_m) for k, x in enumerate(np.arange(20.0, 31.0, 0.5))]
+    log = [corridor(float(x), k, depths_m) for k, x in enumerate(x_m)]
+    localizer = Localizer(map_of(Path("map"), Part("map", mapped, np.empty(0))), initial=log[0].T_odom_lidar)
+    placed = [localizer.process(Scan.of(each.points, 0.1 * k, index=k)) for k, each in enumerate(log)]
+    states = np.array([each.state for each in placed])
+    assert (states[(x_m > 22.0) & (x_m < 31.0)] == MapState.LOCALIZED).all()  # the map is within sight, farther on
+    assert (states[(x_m > 34.5) & (x_m < 35.5)] == MapState.UNMATCHED).all()
+    assert (states[x_m > 36.5] == MapState.OUTSIDE).all()  # 5 m away
+    sigma_m = np.array([np.sqrt(np.trace(each.covariance[:2, :2])) for each in placed])
+    assert (np.diff(sigma_m[x_m > 34.5]) > 0.0).all() and sigma_m[-1] > 1.5 * sigma_m[x_m < 31.0][-1]
+    off_m = [lie.apart(each.T_map_lidar, true.T_odom_lidar)[0] for each, true in zip(placed, log, strict=True)]
+    assert (off_m < 5.0 * sigma_m).all()
+
+
+def test_an_uncertain_heading_becomes_an_uncertain_position_aside_as_the_lidar_moves_ahead():
+    keyframe = Keyframe(0, 0, 0, None, lie.pose_2d(3.0, 4.0, 1.0), 0.0)
+    ahead = keyframe.T_odom_lidar @ lie.pose_2d(10.0, 0.0, 0.0)
+    moved = _moved(np.diag([0.01, 0.01, 0.04]), keyframe, ahead)
+    np.testing.assert_allclose(moved, [[0.01, 0.0, 0.0], [0.0, 4.01, 0.4], [0.0, 0.4, 0.04]], atol=1e-12)

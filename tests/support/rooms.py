@@ -52,6 +52,18 @@ def part(name: str, solids: Solids, T_map_room=None, count: int = 8) -> Part:
     return Part(name, keyframes, np.array(poses))
 
 
+def corridor(x_m, index, depths_m):
+    """A keyframe in a corridor, one wall of which is as far away as said for every meter along it."""
+    angles = np.arange(-np.pi, np.pi, 0.01)
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    ranges_m = np.arange(0.0, 10.0, 0.02)
+    along, across = x_m + ranges_m * directions[:, :1], ranges_m * directions[:, 1:]
+    is_wall = (across < -1.0) | (across > depths_m[np.clip(along, 0.0, 59.9).astype(int)])
+    seen = is_wall.any(axis=1)
+    points = ranges_m[is_wall.argmax(axis=1)][seen, None] * directions[seen]
+    return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
+
+
 def map_of(folder: Path, *parts: Part) -> SavedMap:
     """A map of one or several sessions, with an edge from each keyframe to the next of its session."""
     keyframes = tuple(keyframe for each in parts for keyframe in each.keyframes)

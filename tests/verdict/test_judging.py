@@ -69,6 +69,17 @@ def test_a_trajectory_that_does_not_move_is_at_rest_unless_scans_leave_a_directi
     assert "stays within" not in judge(evidence(rest((0.0, 0.0, 0.05)))).reason
 
 
+@pytest.mark.parametrize(("bound_m", "verdict"), [(0.09, Verdict.TRUSTWORTHY), (0.11, Verdict.CHECK)])
+def test_on_a_short_path_an_error_bar_of_a_tenth_of_a_meter_suffices(bound_m, verdict):
+    path = chained(np.tile([0.02, 0.0, 0.0], (100, 1)), np.random.default_rng(0), 0.001)
+    assert judge(evidence(path, bound_m=bound_m)).verdict is verdict
+
+
+def test_a_few_seconds_of_slow_motion_are_no_rest():
+    slow = chained(np.tile([0.03, 0.0, 0.0], (20, 1)), np.random.default_rng(0), 0.001)
+    assert "stays within" not in judge(evidence(slow)).reason
+
+
 def test_of_a_trajectory_that_does_not_move_the_wheels_say_whether_the_lidar_rested():
     is_open = np.ones(201, bool)
     still = judge(evidence(rest(), wheels=chained(np.zeros((200, 3)), np.random.default_rng(0))))

@@ -31,6 +31,23 @@ def test_rejected_closures_that_agree_with_each_other_are_a_finding_from_three_o
     assert all(each.size_m == pytest.approx(2.0) for each in judged.segments)
 
 
+@pytest.mark.parametrize(("apart", "verdict"), [(40, Verdict.CHECK), (60, Verdict.TRUSTWORTHY)])
+def test_closures_more_than_ten_meters_apart_along_both_paths_are_no_group(apart, verdict):
+    pairs = [(5 + apart * k, 605 + apart * k) for k in range(3)]
+    wrong = [((i, j), lie.between(POSES[i], POSES[j] @ lie.pose_2d(2.0, 0.0, 0.0))) for i, j in pairs]
+    assert judge(evidence(closures=wrong)).verdict is verdict
+
+
+@pytest.mark.parametrize(("off_m", "verdict"), [(0.3, Verdict.CHECK), (0.6, Verdict.TRUSTWORTHY)])
+def test_closures_that_differ_by_more_than_odometry_between_them_allows_are_no_group(off_m, verdict):
+    pairs = [(5 + 40 * k, 605 + 40 * k) for k in range(3)]  # 8 m from one to the next
+    wrong = [
+        ((i, j), POSES[i], POSES[j] @ lie.pose_2d(2.0 + off_m * k, 0.0, 0.0)) for k, (i, j) in enumerate(pairs)
+    ]
+    closures = [(pair, lie.between(*poses)) for pair, *poses in wrong]
+    assert judge(evidence(closures=closures)).verdict is verdict
+
+
 def test_a_group_lies_between_its_ends_whichever_of_its_scans_is_the_source():
     wrong = lie.pose_2d(2.0, 0.0, 0.0)
     pairs = [(10 + 5 * k, 610 + 5 * k) for k in range(4)]
