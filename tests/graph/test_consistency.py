@@ -1,11 +1,13 @@
 """Edges against all others, and groups of edges that agree."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.graph.consistency import Consistency, agreeing_groups, apart, carried, connected
+from scanchain.graph.consistency import Consistency, agreeing_groups, apart, carried, connected, is_bent
 from scanchain.graph.problem import GraphProblem
 from tests.support.graphs import graph_of
 
@@ -76,6 +78,27 @@ def test_a_group_differs_by_no_more_than_odometry_between_its_edges_may_and_is_n
     problem = graph_of(true, edges, Z, information, np.arange(len(edges)) >= 199)._prepared()
     groups = agreeing_groups(problem, true, np.ones(len(edges), bool), 16.0)
     assert [len(group) for group in groups] == sizes
+
+
+@pytest.mark.parametrize(
+    ("increase", "is_rejected", "bent"),
+    [
+        (np.full(20, 2.0), False, False),
+        (np.full(20, 4.0), False, True),  # all of them by more than their three residuals
+        (20.0 * np.eye(20)[3], False, True),  # one by more than an edge in force may have
+        (20.0 * np.eye(20)[3], True, False),
+        (10.0 * np.eye(20)[3], False, False),
+        (500.0 * np.eye(20)[19], False, False),  # that of a single pose is not of the map
+    ],
+)
+def test_a_map_is_bent_by_what_its_edges_contradict_one_by_one_or_on_average(increase, is_rejected, bent):
+    edges = np.column_stack([np.append(np.arange(19), -1), np.arange(1, 21)])
+    rejected = is_rejected & (np.arange(20) == 3)
+    before, after = (
+        SimpleNamespace(edges=edges, edge_chi2=chi2, poses=np.empty((21, 3, 3)), is_rejected=rejected)
+        for chi2 in (np.ones(20), 1.0 + increase)
+    )
+    assert is_bent(before, after, 1.0) is bent
 
 
 def test_a_pose_carried_along_true_poses_is_the_true_one(dimension):

@@ -70,6 +70,24 @@ def test_a_submap_of_a_map_has_twice_as_many_keyframes_the_nearest_ones_of_any_p
     seen = np.round(submaps.around(10, keyframes, 59).points() + positions[10], 1)
     nearest = np.argsort(np.linalg.norm(positions - positions[10], axis=1), kind="stable")[:22]
     assert sorted(map(tuple, seen)) == sorted(map(tuple, positions[nearest]))
+    assert submaps.around(10, keyframes, 70) is submaps.around(10, keyframes, 59)  # whatever the log adds
+
+
+def test_a_submap_of_a_map_in_space_holds_every_second_one_of_its_keyframes():
+    cloud = stored(np.random.default_rng(0).uniform(0.1, 0.4, (9, 3)))
+    keyframes = [Keyframe(k, k, k, cloud, lie.lift(lie.pose_2d(1.0 * k, 0.0, 0.0)), 1.0 * k) for k in range(60)]
+    submaps = VoxelSubmaps(3, 5, configured(3).local_map, Segments())
+    submaps.add_map(keyframes)
+    x_m = np.sort(submaps.around(30, keyframes, 59).points()[:, 0])
+    assert len(x_m) == 11 and np.allclose(np.diff(x_m), 2.0) and -11.0 < x_m[0] < -9.0
+
+
+def test_submaps_that_were_used_last_are_kept():
+    points = stored(np.array([[0.0, 0.0], [0.0, 0.01], [0.01, 0.0]]))
+    keyframes = [Keyframe(k, k, k, points, lie.pose_2d(1.0 * k, 0.0, 0.0), 1.0 * k) for k in range(350)]
+    submaps = VoxelSubmaps(2, 5, configured(2).local_map, Segments())
+    made = {anchor: submaps.around(anchor, keyframes, 349) for anchor in range(0, 350, 5)}
+    assert all(submaps.around(anchor, keyframes, 349) is made[anchor] for anchor in range(300, 350, 5))
 
 
 def test_a_submap_of_a_map_takes_no_more_memory_than_its_voxels():

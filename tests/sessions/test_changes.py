@@ -46,6 +46,9 @@ def test_what_the_other_map_did_not_see_is_unknown():
     assert near.sum() > 30
     assert (found.labels[near] == Label.UNKNOWN).all()
     assert [each.kind for each in found.clusters] == ["vanished"]
+    back = changes_between(after, seen_once, load_settings(2).config)
+    near = np.linalg.norm(back.points - HIDDEN, axis=1) < 0.5
+    assert near.sum() > 30 and (back.labels[near] == Label.UNKNOWN).all()
 
 
 def test_what_is_smaller_than_asked_for_is_unknown():

@@ -77,6 +77,28 @@ def test_a_grid_becomes_a_map_of_its_occupied_cells(tmp_path, negate, yaw_rad):
         assert (walls()[::-1][row, column] == 0).all()
 
 
+def outline(*corners):
+    """Points along the walls between corners, close enough for any view of them, in the plane of a cloud."""
+    ends = zip(corners, (*corners[1:], corners[0]), strict=True)
+    walls = [np.linspace(a, b, int(150 * np.linalg.norm(np.subtract(b, a)))) for a, b in ends]
+    return np.pad(np.concatenate(walls), ((0, 0), (0, 1)))
+
+
+def test_a_plan_is_seen_from_inside_its_walls_and_through_none(tmp_path):
+    """A building like an L, with a chamber in its corner."""
+    building = outline((0, 0), (12, 0), (12, 5), (5, 5), (5, 12), (0, 12))
+    write_ply(tmp_path / "plan.ply", np.concatenate([building, outline((1, 1), (4, 1), (4, 4), (1, 4))]))
+    import_map(tmp_path / "plan.ply", tmp_path / "out")
+    found = open_saved_map(tmp_path / "out")
+    positions = found.poses[:, :2, 2]
+    assert not (positions > 8.4).all(axis=1).any()  # between its wings, farther out than they reach around
+    is_inside = ((positions > 1.0) & (positions < 4.0)).all(axis=1)
+    assert 1 <= is_inside.sum() < len(positions) - 4
+    for k in np.flatnonzero(is_inside).tolist():
+        points = found.keyframes[k].points + positions[k]
+        assert points.min() > 0.9 and points.max() < 4.1
+
+
 def test_the_command_line_is_stated_where_there_was_one(tmp_path):
     grid, out = grid_files(tmp_path, walls()), tmp_path / "room"
     import_map(grid, out)

@@ -11,7 +11,16 @@ from scanchain.loops.connectivity import Segments
 from scanchain.loops.submaps import submap_around
 from scanchain.maps import Edges, SavedPoints
 from scanchain.odometry.odometry import first_match
-from scanchain.sessions.joining import Joined, UncertainJoin, changed, graph_of, join, join_all, objection_to
+from scanchain.sessions.joining import (
+    Joined,
+    UncertainJoin,
+    changed,
+    graph_of,
+    join,
+    join_all,
+    objection_to,
+    repeated_paths,
+)  # fmt: skip
 from tests.support.rooms import BOX, corridor, hall, map_of, part, room
 
 
@@ -69,6 +78,16 @@ def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(re
     assert ("also fit other locations" in objection) == bool(objection) == repeats
     few = replace(joined, edges=edges.where(pairs[:, 0] < 3))
     assert "short path" in objection_to(few, count, config)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 4.0])
+def test_a_path_that_fits_the_host_elsewhere_than_where_it_was_joined_is_repeated(off_m):
+    depths_m = np.random.default_rng(4).uniform(1.0, 3.0, 60)
+    host = [corridor(float(x_m), index, depths_m) for index, x_m in enumerate(np.arange(20.0, 38.0, 1.0))]
+    shift = lie.pose_2d(off_m, 0.0, 0.0)
+    guest = [replace(each, T_odom_lidar=shift @ each.T_odom_lidar) for each in host]
+    repeated, paths = repeated_paths(host, guest, np.arange(len(guest)), load_settings(2).config)
+    assert paths > 2 and repeated == (paths if off_m else 0)
 
 
 @pytest.mark.parametrize("held", [-1, 0])

@@ -31,6 +31,13 @@ def test_rejected_closures_that_agree_with_each_other_are_a_finding_from_three_o
     assert all(each.size_m == pytest.approx(2.0) for each in judged.segments)
 
 
+def test_a_group_of_closures_whose_ends_overlap_lies_between_the_outermost():
+    wrong = lie.pose_2d(2.0, 0.0, 0.0)
+    closures = [((i, i + 10), lie.between(POSES[i], POSES[i + 10] @ wrong)) for i in (10, 16, 22)]
+    (group,) = contradicting_groups(evidence(closures=closures).closures, POSES, INTERVAL_S * np.arange(N))
+    assert (group.first, group.last) == (10, 32)
+
+
 @pytest.mark.parametrize(("apart", "verdict"), [(40, Verdict.CHECK), (60, Verdict.TRUSTWORTHY)])
 def test_closures_more_than_ten_meters_apart_along_both_paths_are_no_group(apart, verdict):
     pairs = [(5 + apart * k, 605 + apart * k) for k in range(3)]
