@@ -1,13 +1,13 @@
 """Constants of the product: how many there are, and which change nothing at half and at double their value.
 
-    python -m tests.benchmarks.constants [--room ROOM ...] [--cases N] [--workers N] [--count]
+    python -m tests.benchmarks.constants [--room ROOM ...] [--cases NAME ...] [--workers N] [--count]
 
 A constant is a name in module scope bound to a number, or to a tuple or dictionary of numbers. Each is set to half
 and to double its value in every module that holds it, and those of the cases below that call a function which
 reads it run again, the quick ones first, until the result of one differs in a bit. The table says which,
 "nothing" where all are the same, and "not reached" where no case calls such a function. ROOM limits this to
-constants of files whose path contains it, N to the quickest cases that reach each. Constants of kernels are
-compiled in, and others are read while modules are imported: both are only counted.
+constants of files whose path contains it, NAME to these cases. Constants of kernels are compiled in, and others
+are read while modules are imported: both are only counted.
 """
 
 from __future__ import annotations
@@ -194,15 +194,15 @@ def usual(name: str) -> tuple[str, frozenset[tuple[str, str]], float]:
     return digest(CASES[name]), called, time.perf_counter() - started
 
 
-def tried(constant: Constant, most: int) -> str:
-    """The first case whose result differs with another value, and that value."""
-    cases = sorted((name for name in CASES if readers(constant, usual(name)[1])), key=lambda name: usual(name)[2])
-    for name in cases[:most]:
+def tried(constant: Constant, names: list[str]) -> str:
+    """The first of the cases whose result differs with another value, and that value."""
+    cases = sorted((name for name in names if readers(constant, usual(name)[1])), key=lambda name: usual(name)[2])
+    for name in cases:
         for factor in FACTORS:
             with Changed(constant, factor):
                 if digest(CASES[name]) != usual(name)[0]:
                     return f"{name} at {factor:g}"
-    return f"nothing ({', '.join(cases[:most])})" if cases else "not reached"
+    return f"nothing ({', '.join(cases)})" if cases else "not reached"
 
 
 def slam_of(scans: Iterable[Scan], dimension: int, mounting: Matrix | None = None, **options: object) -> bytes:
@@ -380,7 +380,7 @@ CASES: dict[str, Case] = {
 
 
 def main() -> None:
-    arguments = options_of(__doc__, cache=False, room=[""], count=False, cases=len(CASES), workers=1)
+    arguments = options_of(__doc__, cache=False, room=[""], count=False, cases=CASES, workers=1)
     names = Counter(each.name for each in constants())
     kernels = sum("/kernels/" in str(each.path) for each in constants())
     shared = sum(count > 1 for count in names.values())
@@ -395,7 +395,7 @@ def main() -> None:
     ]
     with ProcessPoolExecutor(arguments.workers, get_context("spawn")) as executor:
         for constant, found in zip(
-            chosen, executor.map(partial(tried, most=arguments.cases), chosen), strict=True
+            chosen, executor.map(partial(tried, names=arguments.cases), chosen), strict=True
         ):
             row(f"`{constant.module}.{constant.name}`", constant.value, found)
 
