@@ -70,12 +70,13 @@ def map_of(folder: Path, *parts: Part) -> SavedMap:
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
     sessions = tuple(Session(each.name, 0, 9, len(each.keyframes)) for each in parts)
     starts = np.flatnonzero(numbers[:-1] == numbers[1:])
-    poses = np.concatenate([[keyframe.T_odom_lidar for keyframe in each.keyframes] for each in parts])
-    information = np.tile(np.diag(lie.by_component(lie.twist_size(poses[0]), 1e4, 1e5)), (len(starts), 1, 1))
+    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes]) if keyframes else np.empty((0, 3, 3))
+    dimension = poses.shape[-1] - 1
+    information = np.tile(np.diag(lie.by_component(3 * dimension - 3, 1e4, 1e5)), (len(starts), 1, 1))
     motions, count = lie.between(poses[starts], poses[starts + 1]), len(starts)
     pairs = np.column_stack([starts, starts + 1])
     edges = Edges(pairs, motions, information, np.zeros(count, np.bool_), np.ones(count))
-    return SavedMap(folder, len(poses[0]) - 1, keyframes, numbers, sessions, edges)
+    return SavedMap(folder, dimension, keyframes, numbers, sessions, edges)
 
 
 def saved(folder: Path, *parts: Part) -> Path:
