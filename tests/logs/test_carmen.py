@@ -103,6 +103,15 @@ def test_wheels_mounting_and_truth_of_a_log(tmp_path):
     assert "/ground_truth: poses of base_link, moved to the lidar, at" in str(log.notes)
 
 
+def test_the_place_of_a_laser_on_its_robot_has_a_side_and_an_angle(tmp_path):
+    lines = [
+        f"PARAM robot_frontlaser_{name}offset {value} nohost 0"
+        for name, value in (("", 0.35), ("side_", -0.1), ("angular_", 0.5))
+    ]
+    log, _ = read(save(tmp_path / "a.log", *lines, flaser(0)))
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.35, -0.1, 0.5), atol=1e-12)
+
+
 def test_a_robotlaser_line_tells_angles_reach_wheels_and_mounting_itself(tmp_path):
     robot = lie.pose_2d(3.0, 4.0, 1.0)
     laser = robot @ lie.pose_2d(0.2, 0.1, 0.5)

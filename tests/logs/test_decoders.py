@@ -65,7 +65,7 @@ def test_an_increment_of_zero_follows_from_the_angles_of_both_ends_and_without_t
     log = open_log(write(tmp_path / "unset.mcap", [scan_said(STAMP_NS, unset)]))
     (scan,) = log.scans()
     np.testing.assert_allclose(scan.points, only_scan(tmp_path, scan_said(STAMP_NS, usual)).points, atol=1e-6)
-    says(str(log.damage), "last beam at -1.000 rad by angle_increment, 1.000 by angle_max: angle_max used")
+    says(str(log.damage), "last beam is at -1.000 rad by angle_increment, 1.000 by angle_max: angle_max used")
     with pytest.raises(InputError, match="0 rad apart"):
         only_scan(tmp_path, scan_said(STAMP_NS, degenerate))
 
@@ -86,7 +86,20 @@ def test_angles_that_contradict_each_other_are_told(tmp_path, step, last, is_sai
     data = ROS.serialize(message, "sensor_msgs/msg/LaserScan")
     log = open_log(write(tmp_path / "a.mcap", [scan_said(STAMP_NS, data)]))
     list(log.scans())
-    assert ("the angles of 1 of 1 scan of /scan contradict each other" in str(log.damage)) == is_said
+    assert ("1 of 1 scan of /scan contradict themselves (the first: its last beam" in str(log.damage)) == is_said
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "more"), [(12, 1, "12 more points than height 1 × width 12"), (24, 1, ""), (2, 12, "")]
+)
+def test_points_beyond_width_and_height_are_told(tmp_path, width, height, more):
+    message = ROS.point_cloud(STAMP_NS, random_rows(np.dtype([(name, "<f4") for name in "xyz"])))
+    message.width, message.height, message.row_step = width, height, width * message.point_step
+    data = ROS.serialize(message, "sensor_msgs/msg/PointCloud2")
+    log = open_log(write(tmp_path / "a.mcap", [cloud_said(STAMP_NS, data)]))
+    (scan,) = log.scans()
+    assert len(scan.points) == width * height - scan.dropped
+    assert log.damage == [] if not more else more in str(log.damage)
 
 
 def test_beams_without_return_are_dropped_with_their_times_and_counted(tmp_path):

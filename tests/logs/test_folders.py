@@ -14,6 +14,18 @@ from tests.support import recorders
 from tests.support.recorders import SECOND, STAMP_NS, assert_clouds, read
 from tests.support.sensor_files import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
 
+PCD_HEAD = """VERSION 0.7
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+COUNT 1 1 1
+WIDTH 64
+HEIGHT 1
+VIEWPOINT {viewpoint}
+POINTS 64
+DATA ascii
+"""
+
 
 def assert_points(scans, said):
     for scan, cloud in zip(scans, said, strict=True):
@@ -313,3 +325,12 @@ def test_numbers_of_kitti_beyond_all_measure_are_damage_and_no_warnings_of_numpy
     except InputError as error:
         damage = str(error)
     assert "contains numbers that are not finite or too large" in damage
+
+
+def test_a_pose_in_a_pcd_file_that_is_not_used_is_told(tmp_path):
+    for k, viewpoint in enumerate(["0 0 0 1 0 0 0", "0.0 0 0 1.0 0 0 0", "1 2 0 1 0 0 0"]):
+        xyz = "\n".join(f"{i} {j} {i % 3}" for i in range(1, 9) for j in range(1, 9))
+        head = PCD_HEAD.format(viewpoint=viewpoint)
+        (tmp_path / f"{k + 1}.0.pcd").write_text(f"{head}{xyz}\n")
+        log, _ = read(tmp_path)
+        assert ("its VIEWPOINT is not used" in str(log.notes)) == (k == 2)

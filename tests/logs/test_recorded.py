@@ -1,5 +1,6 @@
 """Logs as other people's writers record them: messages of every kind in MCAP, bags of ROS 1 and 2, their parts."""
 
+import json
 import shutil
 import struct
 
@@ -15,7 +16,17 @@ from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support import recorders
 from tests.support.naive_logs import office, write
-from tests.support.recorders import ROS1, ROS2, SECOND, STAMP_NS, Ros, assert_clouds, assert_planar, read_undamaged
+from tests.support.recorders import (
+    ROS1,
+    ROS2,
+    SECOND,
+    STAMP_NS,
+    Ros,
+    assert_clouds,
+    assert_planar,
+    read,
+    read_undamaged,
+)
 
 
 def assert_drive(log, scans):
@@ -326,3 +337,14 @@ def test_a_path_in_metadata_leads_nowhere_else(tmp_path):
     (folder / "metadata.yaml").write_text(text.replace("bag.mcap", f"../{outside.name}"))
     with pytest.raises(InputError):
         read_undamaged(folder)
+
+
+def test_nanoseconds_of_a_foxglove_stamp_in_json_have_the_name_of_ros_too(tmp_path):
+    path = recorders.foxglove_json(tmp_path / "a.mcap", recorders.planar())
+    stamps_ns = [scan.stamp_ns for scan in read(path)[1]]
+    path.write_bytes(b"")
+    dumps = json.dumps
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorders.json, "dumps", lambda told: dumps(told).replace('"nsec"', '"nanosec"'))
+        _, scans = read(recorders.foxglove_json(path, recorders.planar()))
+    assert [scan.stamp_ns for scan in scans] == stamps_ns and any(stamp_ns % SECOND for stamp_ns in stamps_ns)

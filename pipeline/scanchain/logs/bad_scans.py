@@ -172,9 +172,7 @@ class ScanCounts:
             were = "was" if self.bad == 1 else "were"
             lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
         if self.odd:
-            lines.append(
-                f"the angles of {self._share(len(self.odd))} contradict each other (the first: {self.odd[0]})"
-            )
+            lines.append(f"{self._share(len(self.odd))} contradict themselves (the first: {self.odd[0]})")
         if self.repeated > _MOST_REPEATED * self.scans:
             lines.append(
                 f"{self._share(self.repeated)} have the header stamp of the previous one: times in the results do "

@@ -26,7 +26,7 @@ from scanchain.logs.formats import Format, UnknownFormatError
 from scanchain.logs.formats.mcap import temporary_index
 from scanchain.logs.index import FileIndex, most_decompressed_file
 
-_PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
+_PLACE = (b"offset", b"side_offset", b"angular_offset")  # of the laser on the robot, in m and rad
 _RESOLUTION = b"laser_front_laser_resolution"  # parameter with the step of a scanner in degrees
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
@@ -123,11 +123,11 @@ def _write(
 def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float]) -> tuple[bytes, Any, Any]:
     """Message of a FLASER or ROBOTLASER1 line, the robot's pose, and the pose of the laser on the robot.
 
-    parameters : the scanner's maximum range, its step, and its forward offset from the robot's center, as set by
-        the log's PARAM lines for FLASER; ROBOTLASER1 lines state these themselves
+    parameters : the scanner's maximum range, its step, and its place on the robot, as set by the log's PARAM
+        lines for FLASER; ROBOTLASER1 lines state these themselves
     Raises ValueError or IndexError if words are missing or not numbers.
     """
-    offset_m, max_range_m = (parameters.get(name, 0.0) for name in _PARAMETERS)
+    max_range_m = parameters.get(b"robot_front_laser_max", 0.0)
     if words[0] == b"FLASER":
         count = int(words[1])
         poses = _numbers(words[2 + count :], 6)
@@ -135,7 +135,7 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
         step_rad = math.radians(step_deg)
         first_rad = -0.5 * math.pi if count in _FROM_THE_RIGHT else -0.5 * step_rad * (count - 1)
         ranges_m = _numbers(words[2:], count)
-        mounting = planar(offset_m, 0.0, 0.0)
+        mounting = planar(*(parameters.get(b"robot_frontlaser_" + name, 0.0) for name in _PLACE))
     else:
         first_rad, opening_rad, step_rad, max_range_m = _numbers(words[2:], 4)
         count = int(words[8])

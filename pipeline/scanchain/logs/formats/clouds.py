@@ -154,6 +154,14 @@ def read_pcd(path: Path) -> NDArray[np.void]:
         return _rows(file, point, count, is_text=form == "ascii")
 
 
+def _has_viewpoint(path: Path) -> bool:
+    """True if a PCD file states a pose of the lidar other than the origin."""
+    with suppress(OSError, ValueError), path.open("rb") as file:
+        poses = [words[1:] for words in _header_lines(file, "DATA") if words[:1] == ["VIEWPOINT"]]
+        return any(list(map(float, pose)) != [0, 0, 0, 1, 0, 0, 0] for pose in poses)
+    return False
+
+
 def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
     """Words of each line up to the one that begins with ``last``, at most a thousand lines."""
     for _ in range(1000):  # more indicate another kind of file
@@ -249,6 +257,8 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
     if suffix == ".bin" and (columns := _columns(files[0], config.bin_columns)) != config.bin_columns:
         wrong = f"its numbers are those of {columns} columns, not of {config.bin_columns}, and points are wrong"
         index.add_damage(f"{files[0]}: {wrong}: set --log.bin_columns {columns}")
+    if suffix == ".pcd" and _has_viewpoint(files[-1]):  # that of the first may be the origin
+        index.notes.append(f"{files[-1]}: its VIEWPOINT is not used: points are taken as relative to the lidar")
     channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
     for place, (size, stamp_ns) in enumerate(zip(sizes, stamps_ns, strict=True)):
         add_block(index, place, size, [stamp_ns], {channel: 1})

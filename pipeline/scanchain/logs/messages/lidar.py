@@ -78,7 +78,7 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
         last_rad = message.angle_min + steps * message.angle_increment
         used = "angle_increment" if message.angle_increment else "angle_max"
         both = f"{last_rad:.3f} rad by angle_increment, {message.angle_max:.3f} by angle_max"
-        odd = f"last beam at {both}: {used} used"
+        odd = f"its last beam is at {both}: {used} used"
     return Returns(stamp_ns(message), points, times_s, count, why, frame_of(message), stated, odd=odd)
 
 
@@ -156,7 +156,12 @@ def decode_cloud(
     why = ""
     if not count:
         why = _why_none(np.hypot(np.hypot(x, y), z), max(low_m, _NEAREST_M), np.sqrt(high_square))
-    return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why, frame_of(message), stated)
+    height, width, odd = message.height, message.width, ""
+    stated_bytes = height * max(message.row_step, width * message.point_step)
+    if len(message.data) >= stated_bytes + message.point_step > message.point_step:
+        rest = f"{(len(message.data) - stated_bytes) // message.point_step:,} more points than"
+        odd = f"its data have {rest} height {height} × width {width}: the rest is left out"
+    return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why, frame_of(message), stated, odd=odd)
 
 
 def plane_height_m(clouds: Iterable[Returns]) -> float | None:

@@ -124,7 +124,7 @@ class Returns(NamedTuple):
     dropped : number of invalid returns; why : reason if no return is valid
     stated : times as in the message
     others : sweeps of other lidars, in the frame of the first publisher of the topic
-    odd : contradiction in the angles of a laser scan, as text
+    odd : contradiction in the angles of a laser scan, or the size of a cloud, as text
     """
 
     stamp_ns: int
