@@ -457,3 +457,14 @@ def test_of_a_receiver_rate_place_and_stated_errors_are_told_and_one_without_a_f
     none = [(0.2 * k, lambda ns: pack_fix(ns, "a", (49.0, 8.4, 9.0), None)) for k in range(9)]
     found = diagnose(*beside(log, tmp_path, "/fix", none))["GNSS"]
     assert (found.severity, found.effect) == ("warning", "it is not used") and "no fixes" in found.found
+
+
+def test_wheels_that_never_move_or_are_of_another_clock_are_no_good_wheels(tmp_path):
+    times_ns = [STAMP_NS + k * STEP_NS for k in range(40)]
+    still = [odometry_said(time_ns, odometry(time_ns, 1.0, 0.0)) for time_ns in times_ns]
+    found = diagnose(saved(tmp_path, [*drive(), *still]))["wheels"]
+    assert (found.severity, found.fix) == ("warning", "--odometry.prior constant-velocity")
+    assert "the robot never moves" in found.found
+    found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))["wheels"]
+    assert "40 of 40 scans without" in found.found and "37.00 s off" in found.found
+    assert found.fix == "--log.odometry_delay_s 37.00"

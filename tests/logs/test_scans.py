@@ -300,6 +300,31 @@ def test_a_transform_of_another_frame_that_is_no_pose_costs_no_mounting(tmp_path
     np.testing.assert_allclose(log.stated_mounting, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
 
 
+def test_a_transform_of_the_lidar_that_is_no_pose_is_named(tmp_path):
+    told = transforms(("base_link", "laser", np.nan, 0.0, 0.0, 0.0))
+    log, _ = read(write(tmp_path / "a.mcap", [transforms_said(STAMP_NS, told), one_scan(0.1, 0.1)]))
+    assert log.stated_mounting is None and "base_link → laser is no pose" in log.notes[0]
+
+
+@pytest.mark.parametrize("late_s", [3600.0, -37.0])
+def test_wheels_of_another_clock_are_told_with_the_key_that_mends_them(tmp_path, late_s):
+    said = [
+        each
+        for k in range(100)
+        for each in (*wheels((0.1 * k, 0.1 * k + late_s, 0.1 * k)), one_scan(0.1 * k, 0.1 * k))
+    ]
+    path = write(tmp_path / "a.mcap", said)
+    log, scans = read(path)
+    assert all(scan.T_odom_base is None for scan in scans)
+    flag = f"--log.odometry_delay_s {late_s:.2f}"
+    assert (
+        f"{'after' if late_s > 0 else 'before'} those of the scans, as of another clock: {flag}" in log.notes[-1]
+    )
+    log, scans = read(path, odometry_delay_s=late_s)
+    assert "clock" not in str(log.notes)
+    assert [scan.T_odom_base[0, 2] for scan in scans[:-1]] == pytest.approx([0.1 * k for k in range(99)])
+
+
 def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
     yaw, x, y = 0.4, 0.2, -0.1
     said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", x, y, yaw, np.pi))), one_scan(0.1, 0.1)]

@@ -116,7 +116,7 @@ class Facts(NamedTuple):
 
 
 class Survey:
-    """Statistics of the readable scans of a log, their times, and stamped wheel odometry positions (d,)."""
+    """Statistics of the readable scans of a log, their times, and stamped wheel odometry poses (d, d+1)."""
 
     def __init__(self, log: Log) -> None:
         self.log, self.noise = log, RangeNoise()
@@ -132,7 +132,7 @@ class Survey:
         self.stamps_ns.append(scan.stamp_ns)
         self.noise = self.noise.measured(scan.points)
         if scan.T_odom_base is not None:
-            self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
+            self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1]))
         if (found := scan.inertial) is not None:
             self.inertial.append((found.stamps_ns, float(np.linalg.norm(found.accelerations.mean(axis=0)))))
         if scan.fixes is not None:
@@ -252,11 +252,20 @@ def _wheels(seen: Survey) -> Finding:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
         effect = "no vehicle is as fast: millimeters, or jumps? Poses are predicted far from the robot"
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
+    if len(seen.wheels) > 1 and not np.ptp([T for _, T in seen.wheels], axis=0).any():
+        effect = (
+            "if the robot moved, predictions at standstill are wrong: record its encoders, or leave them unused"
+        )
+        return Finding("wheels", Severity.WARNING, f"{found}; by them the robot never moves", effect, without)
     if delay_s := seen.wheel_delay_s:
         found += f"; its stamps are {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'}"
         effect = "they predict the motion of another time"
         fix = f"--log.odometry_delay_s {log.config.odometry_delay_s + delay_s:.2f}"
         return Finding("wheels", Severity.WARNING, found, effect, fix)
+    if late_s := log.wheels_late_s:
+        found += f"; its stamps are {late_s:.2f} s off, as of another clock"
+        fix = f"--log.odometry_delay_s {log.config.odometry_delay_s + late_s:.2f}"
+        return Finding("wheels", Severity.WARNING, found, "they are not used", fix)
     if missed:
         return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
     if log.stated_mounting is None:
@@ -270,7 +279,7 @@ def _wheel_speed_m_s(seen: Survey) -> float:
     if not seen.wheels:
         return 0.0
     stamps_ns, order = np.unique([stamp_ns for stamp_ns, _ in seen.wheels], return_index=True)
-    positions = np.array([seen.wheels[k][1] for k in order])
+    positions = np.array([seen.wheels[k][1][:, -1] for k in order])
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     moving = steps_m > 1e-3  # m
     return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0

@@ -93,6 +93,7 @@ class Log:
 
     Set by reading, once ``scans`` is exhausted or closed:
     bad_scans, scans_with_wheels : number of scans left out, and with a wheel reading near their stamp
+    wheels_late_s : how late the stamps of the wheels are if they are of another clock, else 0
     times : reader of the point times; jumps : warnings about jumps or a wrong rate of the header stamps
     together : the other lidars
     """
@@ -147,7 +148,13 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         self.imu, self.gnss = find_sensors(indexes, config, self.publishers.frame, self.span, self.notes)
         self.sample_decoders = self._sample_decoders(wheels, truth)
-        self.scans_with_wheels, self.bad_scans, self.distorted_share, self.distortion = 0, 0, 0.0, ""
+        self.scans_with_wheels, self.bad_scans, self.distorted_share, self.distortion, self.wheels_late_s = (
+            0,
+            0,
+            0.0,
+            "",
+            0.0,
+        )
         self.jumps, self._truth, self._opening_notes = list[str](), None, tuple(self.notes)
 
     def __repr__(self) -> str:
@@ -246,7 +253,7 @@ class Log:
             self._truth = recorded.ground_truth(self._lidar_on)
         finally:  # also if the caller stops early
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
-            lost = [*recorded.losses(), *self.together.losses()]
+            self.wheels_late_s, lost = recorded.wheels_late_s(), [*recorded.losses(), *self.together.losses()]
             self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *lost]
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
             is_said = any(note.startswith(UNTIMED.partition(":")[0]) for note in self._opening_notes)
@@ -359,7 +366,8 @@ class Log:
                 or recorded.covers(first)
             ):
                 scan = waiting.popleft()
-                wheels = recorded.wheels(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+                value, log_time_ns = scan.value, scan.log_time_ns
+                wheels = recorded.wheels(value.stamp_ns, log_time_ns) if isinstance(value, Returns) else None
                 yield scan, wheels and scaled.corrected(wheels.T_parent_child)
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:

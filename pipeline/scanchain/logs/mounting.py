@@ -204,15 +204,23 @@ def find_mounting(
     if (stated := _stated(indexes, bases, frame, span)) is not None:
         return stated
     fixed, rivals = _fixed(indexes)
+    broken = {
+        f"{each.parent} → {each.child}"
+        for is_fixed in (True, False)
+        for each in _transforms(indexes, is_fixed=is_fixed, span=span, is_pose=False)
+        if not _is_world(each.parent)
+    }
+    wrong = f"{', '.join(sorted(broken))} is no pose (NaN, or a quaternion of zeros): correct it" if broken else ""
     root = _root([each for each in fixed if not _is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is used as the base"
-        notes = filter(None, [note, _disagreeing(fixed, rivals, root, frame)])
+        notes = filter(None, [note, wrong, _disagreeing(fixed, rivals, root, frame)])
         return Mounting(root, T_root_lidar, note="; ".join(notes), is_stated=False)
     mounting = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
     note = f"no static transform from {bases[0]} to {frame or 'the lidar'}: the mounting {mounting}"
-    return Mounting("", np.eye(4), note=note if fixed or wheels else "", is_stated=False)
+    notes = filter(None, [note if fixed or wheels or wrong else "", wrong])
+    return Mounting("", np.eye(4), note="; ".join(notes), is_stated=False)
 
 
 def stated_poses(text: str, key: str) -> list[Pose]:
@@ -365,15 +373,20 @@ def in_plane(T_base_lidar: Pose) -> Pose:
     return lie.flatten(T_base_lidar)
 
 
-def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None) -> list[StampedPose]:
-    """Transforms of the static topics, or of those that may change, sampled over the span."""
+def _transforms(
+    indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None, is_pose: bool = True
+) -> list[StampedPose]:
+    """Transforms of the static topics, or of those that may change, sampled over the span; or what is no pose."""
     found: list[StampedPose] = []
     for channel in topics_of(indexes).values():
         if role(channel) == "transforms" and is_moving_transforms(channel) != is_fixed:
-            found += _sampled(indexes, channel, span)
+            found += _sampled(indexes, channel, span, is_pose=is_pose)
     return found
 
 
-def _sampled(indexes: Sequence[FileIndex], channel: Channel, span: Span | None) -> list[StampedPose]:
+def _sampled(
+    indexes: Sequence[FileIndex], channel: Channel, span: Span | None, *, is_pose: bool = True
+) -> list[StampedPose]:
     sample = sampled_messages(indexes, channel.topic, reader(channel), span)
-    return [each for message in sample for each in message.value]
+    found = (each for message in sample for each in message.value)
+    return [each for each in found if np.isfinite(each.T_parent_child).all() == is_pose]

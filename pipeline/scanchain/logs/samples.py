@@ -10,7 +10,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Fixes, Inertial, Pose, Trajectory
-from scanchain.errors import counted
+from scanchain.errors import counted, duration
 from scanchain.logs.index import Decoded
 from scanchain.logs.messages.gnss import Fix
 from scanchain.logs.messages.inertial import ImuSample
@@ -137,10 +137,12 @@ class Recorded:
         self._given_ns, self._has_imu = 0, imu is not None  # stamp of the last sample that a scan has
         named = {odometry_topic: self.odometry, "" if imu is None else imu.topic: self.imu}
         self.streams: dict[str, SampleStream[Any]] = {topic: stream for topic, stream in named.items() if topic}
-        self.ground_truth_topic = ground_truth_topic
+        self.odometry_topic, self.ground_truth_topic = odometry_topic, ground_truth_topic
         self.truth: list[StampedPose] = []
         self._frames: dict[str, Pose | None] = {}  # of the truth, with the lidar's pose in each if it is known
         self._malformed: dict[str, list[str]] = {}  # by topic, the defect of each message
+        self._odometry_ns: int | None = None  # stamp of the latest sample of the wheels minus its log time
+        self._late_ns = list[int]()  # that minus the same of each scan, 0 of one with wheels
 
     def add(self, message: Decoded) -> None:
         """Add the samples of a message to the stream of its topic."""
@@ -152,10 +154,10 @@ class Recorded:
             if topic == self.ground_truth_topic:
                 self.truth.append(sample)
             if topic in self.streams:
-                delay_ns = self._delays_ns[topic]
-                self.streams[topic].add(
-                    sample._replace(stamp_ns=sample.stamp_ns - delay_ns) if delay_ns else sample
-                )
+                stamp_ns = sample.stamp_ns - self._delays_ns[topic]
+                self.streams[topic].add(sample._replace(stamp_ns=stamp_ns))
+                if self.streams[topic] is self.odometry:
+                    self._odometry_ns = stamp_ns - message.log_time_ns
             if isinstance(sample, Fix):
                 self._fixes.append(sample)
 
@@ -166,10 +168,19 @@ class Recorded:
             for stream in self.streams.values()
         )
 
-    def wheels(self, stamp_ns: int) -> StampedPose | None:
+    def wheels(self, stamp_ns: int, log_time_ns: int) -> StampedPose | None:
         """The wheel reading at a stamp; if stamps are late, None without a later one, since the last one lags."""
         is_late = self.patience_ns > NEAREST_NS
-        return None if is_late and not self.odometry.covers(stamp_ns) else self.odometry.at(stamp_ns)
+        found = None if is_late and not self.odometry.covers(stamp_ns) else self.odometry.at(stamp_ns)
+        if self._odometry_ns is not None:
+            self._late_ns.append(0 if found else self._odometry_ns - (stamp_ns - log_time_ns))
+        return found
+
+    def wheels_late_s(self) -> float:
+        """How late the stamps of the wheels are by log times (median), if they are of another clock; else 0."""
+        late_ns = np.array(self._late_ns or [0], np.float64)
+        is_apart = np.ptp(late_ns) < NEAREST_NS < np.abs(late_ns).min()
+        return 1e-9 * float(np.median(late_ns)) if is_apart else 0.0
 
     def inertial(self, returns: Returns) -> Inertial | None:
         """Samples of the IMU since those of the scan before, to the first after this one.
@@ -222,6 +233,10 @@ class Recorded:
             if T is None or not np.array_equal(T, np.eye(len(T)))
         }
         notes = [f"{self.ground_truth_topic}: poses of {child}, {how}" for child, how in done.items()]
+        if late_s := self.wheels_late_s():
+            apart = f"{duration(abs(late_s))} {'after' if late_s > 0.0 else 'before'} those of the scans"
+            flag = f"--log.odometry_delay_s {1e-9 * self._delays_ns[self.odometry_topic] + late_s:.2f}"
+            notes.append(f"stamps of {self.odometry_topic} are {apart}, as of another clock: {flag}")
         if self._has_imu and not self._given_ns:
             notes.append("no sample of the IMU is of the time of a scan, as of another clock: it is not used")
         if self._far:

@@ -44,15 +44,16 @@ Frames = tuple[str, str]  # parent and child
 def read_transforms(message: Any, link: Frames | None = None, dimension: int = 3) -> list[StampedPose]:
     """Transforms of a tf2_msgs/TFMessage, all or those of the frames ``link``; flattened for dimension 2.
 
-    Raises MalformedMessageError for one of the link that is no pose; others that are none are left out, as in tf2.
+    Raises MalformedMessageError for one of the link that is no pose; others that are none are NaN.
     """
     found = list[StampedPose]()
     for each in message.transforms:
         frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
         if link in (None, frames):
+            T = np.full((dimension + 1, dimension + 1), np.nan)
             with suppress(*() if link else (MalformedMessageError,)):
                 T = pose_of(each.transform.translation, each.transform.rotation, dimension)
-                found.append(StampedPose(stamp_ns(each), *frames, T))
+            found.append(StampedPose(stamp_ns(each), *frames, T))
     return found
 
 
