@@ -324,6 +324,20 @@ def test_truth_that_may_mislead_is_warned_of():
     assert ev.pair(every, drive(100)).warnings == []
 
 
+@pytest.mark.parametrize("axes", ["camera", "none"])
+def test_orientations_of_other_axes_or_none_are_told_and_those_of_another_world_are_not(axes):
+    truth = drive()
+    camera, world = np.eye(4), lie.exp(np.array([9.0, 8.0, 7.0, 0.3, 0.2, 2.0]))
+    camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    poses = world @ truth.poses
+    assert evaluate(truth, Trajectory(truth.stamps_ns, poses)).warnings == []
+    poses = poses @ camera if axes == "camera" else poses.copy()
+    if axes == "none":
+        poses[:, :3, :3] = np.eye(3)
+    (said,) = evaluate(truth, Trajectory(truth.stamps_ns, poses)).warnings
+    assert "orientations are far from the ground truth" in said
+
+
 def test_noise_of_a_fast_truth_does_not_lengthen_the_path_that_is_shown():
     estimate = at_rate(drive(200), 20)
     poses = drive(200).poses.copy()

@@ -26,6 +26,7 @@ SHORT_LENGTHS_M = (10.0, 20.0, 40.0)  # of segments of paths that are too short 
 RELATION_LIMIT_S = 2.0 * ERRORS_S[1]  # between a stamp of a relation and that of its pose
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 _FAR_OFF = (0.02, 0.1)  # ATE above both of which odometry failed: share of the path, meters
+_FAR_OFF_RAD = np.radians(20.0)  # rotation error above which the axes of the truth are others
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
 _LARGEST = 2.0  # largest length of a segment over the requested one
 _FIELDS = "stamp1 stamp2 x y z roll pitch yaw"
@@ -176,10 +177,15 @@ class AbsoluteError(Metric):
         )
 
 
-def far_off(ate_rmse_m: float, share: float | None, path_length_m: float) -> str:
-    """Warning that an ATE is too large for odometry that works; empty where it is not."""
+def far_off(ate_rmse_m: float, share: float | None, path_length_m: float, rotation_rmse_rad: float) -> str:
+    """Warning that an ATE is too large for odometry that works, or only its rotations; empty where neither is."""
     if share is None or share <= _FAR_OFF[0] or ate_rmse_m <= _FAR_OFF[1]:
-        return ""
+        if rotation_rmse_rad <= _FAR_OFF_RAD:
+            return ""
+        return (
+            f"orientations are far from the ground truth, {np.degrees(rotation_rmse_rad):.0f} deg, and positions "
+            "are not: it has none, or those of other axes (a camera's), which rotations, RPE and KITTI compare"
+        )
     return (
         f"far from the ground truth: ATE {ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
         f"{path_length_m:.1f} m; above {100.0 * _FAR_OFF[0]:g} % a trajectory is wrong somewhere, or the truth "
