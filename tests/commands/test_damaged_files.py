@@ -96,6 +96,18 @@ def test_a_run_whose_tables_are_damaged_is_refused_by_their_name(finished, call,
         path.write_bytes(data)
 
 
+@pytest.mark.parametrize("data", [None, b"{"], ids=["absent", "damaged"])
+def test_a_run_without_its_metrics_has_no_verdict_on_an_error_that_it_does_not_know(finished, call, data):
+    path = finished / "metrics.json"
+    before = path.read_bytes()
+    try:
+        path.unlink() if data is None else path.write_bytes(data)
+        code, output, errors = call("check", finished)
+        assert (code, output) == (2, "") and "has no metrics.json that can be read; a verdict needs" in errors
+    finally:
+        path.write_bytes(before)
+
+
 SHAPES = [
     ("keyframes.npz", "session", lambda array: array[:-1]),
     ("keyframes.npz", "session", lambda array: array + 7),

@@ -16,7 +16,7 @@ from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.loops.verification import Verifier
 from scanchain.maps import open_saved_map, read_ply
 from scanchain.runs.job import Job, Progress
-from scanchain.sessions.merging import merge
+from scanchain.sessions.merging import _opened, merge
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.maps import draw_run
 from tests.benchmarks import harness
@@ -251,3 +251,14 @@ def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkey
     assert 0 < work[PlanarMapSearch].call_count < merged.metrics.keyframes / 4
     assert 0 < work[Verifier].call_count < merged.metrics.keyframes
     assert 0 < work[PoseGraph].call_count < merged.metrics.keyframes / 5
+
+
+def test_sessions_of_the_same_times_are_one_only_if_their_keyframes_are(tmp_path):
+    runs = [made.run("office", tmp_path / str(seed), seed=seed, seconds=8.0) for seed in (1, 2)]
+    places = [run.rename(tmp_path / f"run_{k}") for k, run in enumerate(runs)]
+    first, second = (open_saved_map(place).sessions[0] for place in places)
+    assert first.first_stamp_ns == second.first_stamp_ns and first.last_stamp_ns == second.last_stamp_ns
+    assert len(_opened(places, tmp_path / "out")) == 2
+    copied = shutil.copytree(places[0], tmp_path / "copy")
+    with pytest.raises(InputError, match="holds a session that"):
+        _opened([places[0], copied], tmp_path / "out")

@@ -45,7 +45,7 @@ def judge_run(folder: Path) -> Judged:
 
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
-    tables, known = list["pa.Table"](), known_of_run(folder)
+    tables = list["pa.Table"]()
     for path in (folder / "steps.parquet", folder / "loops.parquet"):
         if tables and not path.exists():
             continue
@@ -55,6 +55,7 @@ def judge_run(folder: Path) -> Judged:
             remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
             why = "" if isinstance(error, FileNotFoundError) else f" ({one_line(error)})"
             raise InputError(f"{folder}: has no {path.name} that can be read{why}; {remedy}") from error
+    known = known_of_run(folder)
     try:
         evidence = evidence_of(tables[0], *tables[1:], expected=known.expected_ate_m)
         return judge(evidence, distortion=known.distortion)
@@ -63,11 +64,12 @@ def judge_run(folder: Path) -> Judged:
 
 
 def known_of_run(folder: Path) -> Known:
-    """Expected ATE and distortion in the metrics of a run directory; the defaults where they cannot be read."""
+    """Expected ATE and distortion in the metrics of a run directory. Raises InputError where it has none."""
     try:
         return msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=Known)
-    except (OSError, msgspec.DecodeError):
-        return Known()
+    except (OSError, msgspec.DecodeError) as error:
+        remedy = "a verdict needs its expected error: copy it too, or run the log again"
+        raise InputError(f"{folder}: has no {METRICS_FILE} that can be read; {remedy}") from error
 
 
 def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Override]) -> tuple[Judged, int]:

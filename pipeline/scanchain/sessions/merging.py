@@ -134,10 +134,10 @@ def _opened(runs: Sequence[Path], out: Path) -> list[SavedMap]:
     if len(runs) < 2:
         raise InputError("merge needs at least two run directories; give another one")
     maps = opened_maps(runs, out)
-    holders: dict[tuple[int, int, int], Path] = {}
+    holders: dict[tuple[int, ...], Path] = {}
     for run, saved in zip(runs, maps, strict=True):
-        for session in saved.sessions:
-            key = (session.first_stamp_ns, session.last_stamp_ns, session.keyframes)
+        for number in range(len(saved.sessions)):
+            key = tuple(saved.keyframes[k].stamp_ns for k in (saved.session == number).nonzero()[0])
             if key in holders:
                 raise InputError(f"{run}: holds a session that {holders[key]} also holds; leave one of them out")
             holders[key] = run
