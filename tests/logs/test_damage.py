@@ -190,6 +190,7 @@ def test_what_lies_before_the_cut_in_a_cut_chunk_is_recovered(tmp_path, compress
     scans = list(log.scans())
     assert_true(scans)
     assert (28 if compression == "none" else 10) <= len(scans) < 40 and log.damage
+    assert log.duration_s == pytest.approx(0.1 * (len(scans) - 1), abs=0.11)  # not that of the whole chunk
 
 
 def chunks_of(data):

@@ -265,6 +265,10 @@ class Walk:
         if chunk is not None:
             self._add_chunk(chunk, offset)
             self._close(size, complete=False)
+            if (blocks := self.index.blocks) and blocks[-1].is_cut:  # its head states the end of what is lost, too
+                read, _ = contents(self.index, blocks[-1], None)
+                times_ns = (message.log_time_ns for message in read)
+                blocks[-1] = replace(blocks[-1], end_ns=max(times_ns, default=blocks[-1].end_ns))
 
     def _close(self, offset: int, *, complete: bool) -> None:
         """Add the open chunk or loose messages, which end here, to the index; without incomplete counts."""
