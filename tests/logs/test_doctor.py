@@ -466,5 +466,5 @@ def test_wheels_that_never_move_or_are_of_another_clock_are_no_good_wheels(tmp_p
     assert (found.severity, found.fix) == ("warning", "--odometry.prior constant-velocity")
     assert "the robot never moves" in found.found
     found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))["wheels"]
-    assert "40 of 40 scans without" in found.found and "37.00 s off" in found.found
+    assert "40 of 40 scans without" in found.found and "37.00 s late" in found.found
     assert found.fix == "--log.odometry_delay_s 37.00"

@@ -253,19 +253,13 @@ def _wheels(seen: Survey) -> Finding:
         effect = "no vehicle is as fast: millimeters, or jumps? Poses are predicted far from the robot"
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
     if len(seen.wheels) > 1 and not np.ptp([T for _, T in seen.wheels], axis=0).any():
-        effect = (
-            "if the robot moved, predictions at standstill are wrong: record its encoders, or leave them unused"
-        )
+        effect = "if it moved, they predict a standstill that is none"
         return Finding("wheels", Severity.WARNING, f"{found}; by them the robot never moves", effect, without)
-    if delay_s := seen.wheel_delay_s:
+    if delay_s := seen.wheel_delay_s or log.wheels_late_s:
         found += f"; its stamps are {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'}"
-        effect = "they predict the motion of another time"
+        effect = "not used: another clock" if log.wheels_late_s else "they predict the motion of another time"
         fix = f"--log.odometry_delay_s {log.config.odometry_delay_s + delay_s:.2f}"
         return Finding("wheels", Severity.WARNING, found, effect, fix)
-    if late_s := log.wheels_late_s:
-        found += f"; its stamps are {late_s:.2f} s off, as of another clock"
-        fix = f"--log.odometry_delay_s {log.config.odometry_delay_s + late_s:.2f}"
-        return Finding("wheels", Severity.WARNING, found, "they are not used", fix)
     if missed:
         return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
     if log.stated_mounting is None:

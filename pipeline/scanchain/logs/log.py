@@ -148,14 +148,8 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         self.imu, self.gnss = find_sensors(indexes, config, self.publishers.frame, self.span, self.notes)
         self.sample_decoders = self._sample_decoders(wheels, truth)
-        self.scans_with_wheels, self.bad_scans, self.distorted_share, self.distortion, self.wheels_late_s = (
-            0,
-            0,
-            0.0,
-            "",
-            0.0,
-        )
-        self.jumps, self._truth, self._opening_notes = list[str](), None, tuple(self.notes)
+        self.scans_with_wheels, self.bad_scans, self.distorted_share, self.distortion = 0, 0, 0.0, ""
+        self.jumps, self._truth, self._opening_notes, self.wheels_late_s = [], None, tuple(self.notes), 0.0
 
     def __repr__(self) -> str:
         return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"

@@ -204,22 +204,22 @@ def find_mounting(
     if (stated := _stated(indexes, bases, frame, span)) is not None:
         return stated
     fixed, rivals = _fixed(indexes)
+    above = {frame, *_above(frame, {each.child: each.parent for each in fixed})}
     broken = {
-        f"{each.parent} → {each.child}"
-        for is_fixed in (True, False)
-        for each in _transforms(indexes, is_fixed=is_fixed, span=span, is_pose=False)
-        if not _is_world(each.parent)
+        f"{each.parent} → {each.child} is no pose (NaN, or a quaternion of zeros): correct it"
+        for channel in topics_of(indexes).values()
+        for each in (_sampled(indexes, channel, span, is_pose=False) if role(channel) == "transforms" else ())
+        if each.child in above
     }
-    wrong = f"{', '.join(sorted(broken))} is no pose (NaN, or a quaternion of zeros): correct it" if broken else ""
     root = _root([each for each in fixed if not _is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is used as the base"
-        notes = filter(None, [note, wrong, _disagreeing(fixed, rivals, root, frame)])
+        notes = filter(None, [note, *sorted(broken), _disagreeing(fixed, rivals, root, frame)])
         return Mounting(root, T_root_lidar, note="; ".join(notes), is_stated=False)
     mounting = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
     note = f"no static transform from {bases[0]} to {frame or 'the lidar'}: the mounting {mounting}"
-    notes = filter(None, [note if fixed or wheels or wrong else "", wrong])
+    notes = [note, *sorted(broken)] if fixed or wheels or broken else []
     return Mounting("", np.eye(4), note="; ".join(notes), is_stated=False)
 
 
@@ -373,14 +373,12 @@ def in_plane(T_base_lidar: Pose) -> Pose:
     return lie.flatten(T_base_lidar)
 
 
-def _transforms(
-    indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None, is_pose: bool = True
-) -> list[StampedPose]:
-    """Transforms of the static topics, or of those that may change, sampled over the span; or what is no pose."""
+def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None) -> list[StampedPose]:
+    """Transforms of the static topics, or of those that may change, sampled over the span."""
     found: list[StampedPose] = []
     for channel in topics_of(indexes).values():
         if role(channel) == "transforms" and is_moving_transforms(channel) != is_fixed:
-            found += _sampled(indexes, channel, span, is_pose=is_pose)
+            found += _sampled(indexes, channel, span)
     return found
 
 

@@ -26,15 +26,12 @@ _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericT
 
 
 class _Stamp(Struct, frozen=True):
-    """A stamp; ``nanosec`` is the name in ROS 2."""
-
     seconds: int = field(name="sec", default=0)
-    nsec: int = 0
-    nanosec: int = 0
+    nanos: int = field(name="nsec", default=0)
+    nanosec: int = 0  # as in ROS 2
 
-    @property
-    def nanos(self) -> int:
-        return self.nsec or self.nanosec
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "nanos", self.nanos or self.nanosec)
 
 
 class _Vector(Struct, frozen=True):

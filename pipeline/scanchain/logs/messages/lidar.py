@@ -156,11 +156,9 @@ def decode_cloud(
     why = ""
     if not count:
         why = _why_none(np.hypot(np.hypot(x, y), z), max(low_m, _NEAREST_M), np.sqrt(high_square))
-    height, width, odd = message.height, message.width, ""
-    stated_bytes = height * max(message.row_step, width * message.point_step)
-    if len(message.data) >= stated_bytes + message.point_step > message.point_step:
-        rest = f"{(len(message.data) - stated_bytes) // message.point_step:,} more points than"
-        odd = f"its data have {rest} height {height} × width {width}: the rest is left out"
+    height, width, step, odd = message.height, message.width, message.point_step, ""
+    if (rest := (len(message.data) - height * max(message.row_step, width * step)) // step) > 0 and len(cloud):
+        odd = f"its data have {rest:,} more points than height {height} × width {width}: the rest is left out"
     return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why, frame_of(message), stated, odd=odd)
 
 
