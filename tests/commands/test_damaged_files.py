@@ -103,7 +103,7 @@ def test_a_run_without_its_metrics_has_no_verdict_on_an_error_that_it_does_not_k
     try:
         path.unlink() if data is None else path.write_bytes(data)
         code, output, errors = call("check", finished)
-        assert (code, output) == (2, "") and "has no metrics.json that can be read; a verdict needs" in errors
+        assert (code, output) == (2, "") and "metrics.json: cannot be read, but a verdict needs it" in errors
     finally:
         path.write_bytes(before)
 

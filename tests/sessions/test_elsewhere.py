@@ -12,6 +12,8 @@ from scanchain.errors import InputError
 from scanchain.maps import open_saved_map, write_laz, write_pcd, write_ply
 from scanchain.sessions.elsewhere import import_map
 from scanchain.sessions.localizer import Localizer
+from tests.support import made
+from tests.support.messages import unfolded
 from tests.support.scenes import shared_data
 
 
@@ -331,3 +333,15 @@ def test_a_point_with_a_huge_number_of_values_is_refused(tmp_path):
     (tmp_path / "m.pcd").write_text(pcd)
     with pytest.raises(InputError, match="ends after 0 of its 1 points"):
         import_map(tmp_path / "m.pcd", tmp_path / "out")
+
+
+def test_a_map_of_another_scale_is_said_to_be_another_place_or_scale_and_is_not_merged(tmp_path, call):
+    run = made.run("office", tmp_path, seed=2, seconds=20.0)
+    log = made.log("office", tmp_path, seed=2, seconds=20.0)
+    plan = run / "map.yaml"
+    plan.write_text(plan.read_text().replace("resolution: 0.05", "resolution: 0.06"))
+    import_map(plan, tmp_path / "plan")
+    code, output, _ = call("localize", log, "--map", tmp_path / "plan", "--out", tmp_path / "out")
+    assert code == 1 and "matches plan, or the scale of its file is wrong" in unfolded(output)
+    code, _, errors = call("merge", run, tmp_path / "plan", "--out", tmp_path / "merged")
+    assert code == 2 and "no edges join its keyframes, as in an imported map; merge takes runs" in errors

@@ -253,8 +253,8 @@ def _wheels(seen: Survey) -> Finding:
         effect = "no vehicle is as fast: millimeters, or jumps? Poses are predicted far from the robot"
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
     if len(seen.wheels) > 1 and not np.ptp([T for _, T in seen.wheels], axis=0).any():
-        effect = "if it moved, they predict a standstill that is none"
-        return Finding("wheels", Severity.WARNING, f"{found}; by them the robot never moves", effect, without)
+        found += "; by them the robot never moves"
+        return Finding("wheels", Severity.WARNING, found, "if it did, predictions are wrong", without)
     if delay_s := seen.wheel_delay_s or log.wheels_late_s:
         found += f"; its stamps are {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'}"
         effect = "not used: another clock" if log.wheels_late_s else "they predict the motion of another time"

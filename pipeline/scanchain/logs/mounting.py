@@ -207,9 +207,10 @@ def find_mounting(
     above = {frame, *_above(frame, {each.child: each.parent for each in fixed})}
     broken = {
         f"{each.parent} → {each.child} is no pose (NaN, or a quaternion of zeros): correct it"
-        for channel in topics_of(indexes).values()
-        for each in (_sampled(indexes, channel, span, is_pose=False) if role(channel) == "transforms" else ())
-        if each.child in above
+        for channel in (each for each in topics_of(indexes).values() if role(each) == "transforms")
+        for message in sampled_messages(indexes, channel.topic, reader(channel), span)
+        for each in message.value
+        if each.child in above and np.isnan(each.T_parent_child).any()
     }
     root = _root([each for each in fixed if not _is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
@@ -382,9 +383,6 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
     return found
 
 
-def _sampled(
-    indexes: Sequence[FileIndex], channel: Channel, span: Span | None, *, is_pose: bool = True
-) -> list[StampedPose]:
+def _sampled(indexes: Sequence[FileIndex], channel: Channel, span: Span | None) -> list[StampedPose]:
     sample = sampled_messages(indexes, channel.topic, reader(channel), span)
-    found = (each for message in sample for each in message.value)
-    return [each for each in found if np.isfinite(each.T_parent_child).all() == is_pose]
+    return [each for message in sample for each in message.value if np.isfinite(each.T_parent_child).all()]

@@ -68,8 +68,7 @@ def known_of_run(folder: Path) -> Known:
     try:
         return msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=Known)
     except (OSError, msgspec.DecodeError) as error:
-        remedy = "a verdict needs its expected error: copy it too, or run the log again"
-        raise InputError(f"{folder}: has no {METRICS_FILE} that can be read; {remedy}") from error
+        raise InputError(f"{folder / METRICS_FILE}: cannot be read, but a verdict needs it: copy it") from error
 
 
 def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Override]) -> tuple[Judged, int]:

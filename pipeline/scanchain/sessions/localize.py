@@ -291,7 +291,8 @@ def _verdict(
         elif found.result.map_ambiguous_share >= _AMBIGUOUS_SHARE:
             reason = f"not certain: {tried} fit several locations in {prior.name} equally well"
         else:
-            reason = f"not from this place: nothing in {tried} matches {prior.name}"
+            scale = "" if len(prior.edges.pairs) else ", or the scale of its file is wrong"  # of an imported map
+            reason = f"not from this place: nothing in {tried} matches {prior.name}{scale}"
         return Verdict.NOT_TRUSTWORTHY, reason
     at = found.found_at
     where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")

@@ -136,6 +136,8 @@ def _opened(runs: Sequence[Path], out: Path) -> list[SavedMap]:
     maps = opened_maps(runs, out)
     holders: dict[tuple[int, ...], Path] = {}
     for run, saved in zip(runs, maps, strict=True):
+        if not len(saved.edges.pairs) and len(saved.keyframes) > 1:
+            raise InputError(f"{run}: no edges join its keyframes, as in an imported map; merge takes runs")
         for number in range(len(saved.sessions)):
             key = tuple(saved.keyframes[k].stamp_ns for k in (saved.session == number).nonzero()[0])
             if key in holders:
