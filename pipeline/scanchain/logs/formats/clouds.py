@@ -158,7 +158,7 @@ def _has_viewpoint(path: Path) -> bool:
     """True if a PCD file states a pose of the lidar other than the origin."""
     with suppress(OSError, ValueError), path.open("rb") as file:
         poses = [words[1:] for words in _header_lines(file, "DATA") if words[:1] == ["VIEWPOINT"]]
-        return any(list(map(float, pose)) != [0, 0, 0, 1, 0, 0, 0] for pose in poses)
+        return any(list(map(float, pose)) != [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0] for pose in poses)
     return False
 
 
