@@ -34,6 +34,7 @@ _set = object.__setattr__  # sets a field of a frozen record that checks itself
 GRAVITY_M_S2, _UNIT = 9.81, 1.3  # and largest ratio of it and the specific force at rest
 BRIDGED_S = 0.15  # longest time between two samples of an IMU in use
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
+GAP_INTERVALS = 2.5  # time between scans, in usual intervals, above which scans are missing
 SIMILAR_INTERVALS = 1.4  # largest ratio of two intervals between scans that agree: stamps jitter
 FEWEST_COPIED = 10  # least number of points of a scan that counts as a copy: fewer can be equal by chance
 MOST_COPIES = 5  # largest number of identical scans in a row that a driver that publishes too often produces

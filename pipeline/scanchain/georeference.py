@@ -17,7 +17,7 @@ from scanchain.data import Fixes, Integers, Mask, Matrix, Points, Pose, Trajecto
 from scanchain.errors import counted
 from scanchain.geodesy import Geodesy
 from scanchain.graph.consistency import is_bent
-from scanchain.graph.factors import Position, Prior, RobustPosition
+from scanchain.graph.factors import LARGEST_SIGMAS, Position, Prior, RobustPosition
 from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.gravity import MOUNTED_RAD, upright
@@ -34,7 +34,6 @@ _ANTENNA_M = 1.0  # σ of the antenna's unknown position
 _MOST_RAD = math.radians(15.0)  # σ of the direction above which the place is unknown
 _SURE, _MOST_ALONE = 0.999, 0.1  # probability that errors as stated pass a test; share of fixes that fail it alone
 _HEIGHT_M = 1e3  # σ of heights in the plane, where they are unknown
-_FREE_M, _FREE_RAD = 300.0, 10.0  # σ of the first pose, of which fixes determine position and direction
 _NEAR_NS = 1_000_000_000  # longest time between the scans around a fix
 _MOST_IN_INTERVAL = 100  # fixes of an interval that are compared
 _FIXED = 1e12  # information of an antenna's known position, m⁻²
@@ -330,11 +329,13 @@ def _constrain(
     """Add a prior of the first pose, mainly of its tilt, and positions of keyframes (N,), about at these poses."""
     d, R = graph.dimension, T_enu_world[:3, :3]
     information, R_up_lidar = (
-        np.eye(graph.freedom) * _FREE_M**-2.0,
+        np.eye(graph.freedom) * LARGEST_SIGMAS[0] ** -2.0,
         upright(up) @ lie.lift(graph.poses[0])[:3, :3],
     )
-    of_rotation = R_up_lidar.T @ np.diag(np.array([MOUNTED_RAD, MOUNTED_RAD, _FREE_RAD]) ** -2.0) @ R_up_lidar
-    information[d:, d:] = of_rotation if d == 3 else _FREE_RAD**-2.0
+    of_rotation = (
+        R_up_lidar.T @ np.diag(np.array([MOUNTED_RAD, MOUNTED_RAD, LARGEST_SIGMAS[1]]) ** -2.0) @ R_up_lidar
+    )
+    information[d:, d:] = of_rotation if d == 3 else LARGEST_SIGMAS[1] ** -2.0
     graph.add_factor(Prior(), 0, information, graph.poses[0])
     at = lie.transform(lie.inverse(T_enu_world), sighted.enu_m)
     own = lie.lift(graph.poses[keyframes])

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
-from itertools import islice
+from itertools import islice, product
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,7 +43,7 @@ from scanchain.maps import open_saved_map
 from scanchain.sessions.elsewhere import import_map
 from scanchain.settings import overrides_of
 from scanchain.simulation import WORLDS
-from tests.benchmarks.harness import CACHE, drive_of, options_of, table
+from tests.benchmarks.harness import CACHE, KITTI, drive_of, options_of, table
 from tests.benchmarks.place_odds import right, wrong
 from tests.benchmarks.places import PLACES, prepared, whole_of
 from tests.benchmarks.wrong_edges import try_wrong_loops
@@ -239,6 +239,21 @@ def of_world(world: str, sensor: str, scans: int, every: int = 1) -> Case:
     return case
 
 
+def of_pairs(folder: Path) -> bytes:
+    """Two scans aligned without a guess, near each other and far apart, by both methods."""
+    found = b""
+    for name, apart in (
+        ("2d/mit_csail.mcap", (30, 100, 399)),
+        ("2d/intel.mcap", (60, 699)),
+        ("3d/" + KITTI[0], (4, 20)),
+    ):
+        scans = [scan.points for scan in islice(scanchain.open_log(DATA / name), apart[-1] + 1)]
+        for k, matcher in product(apart, ("plicp", "svd")):
+            match = scanchain.align(scans[0], scans[k], matcher=matcher)
+            found += match.T_target_source.tobytes() + match.information.tobytes() + match.reason.encode()
+    return found
+
+
 def of_standing(folder: Path) -> bytes:
     """A lidar that stands for 5 s, moves on for 2 s, and stands again; in each scan a part of the points."""
     scans = list(islice(scanchain.open_log(DATA / "3d/kitti_0005_first60.mcap"), 20))
@@ -360,6 +375,7 @@ CASES: dict[str, Case] = {
     "elevation": of_log("3d/kitti_0005_first60.mcap", 45),
     "svd-icp": of_log("3d/kitti_0001_first54.mcap", 8, matching__matcher="svd"),
     "pandaset": of_log("3d/pandaset_002_sweeps30to55.mcap", 8, topic="/pandar64/points"),
+    "pairs": of_pairs,
     "standing in a street": of_standing,
     "loops": of_world("town", "vlp-16", 600, every=3),
     "staircase": of_world("staircase", "vlp-16", 100),

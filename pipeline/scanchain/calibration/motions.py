@@ -13,7 +13,7 @@ from scanchain.data import Mask, Matrix, Pose, Vector
 from scanchain.odometry.delay import FEWEST, MOST_DELAY_S, WheelPath, likeliest
 from scanchain.registration.hand_eye import hand_eye, path_m
 
-_STEPS, _STEP = 20, 0.01  # most Gauss-Newton steps; step of a converged parameter, in standard deviations
+STEPS, STEP = 20, 0.01  # most Gauss-Newton steps; step of a converged parameter, in standard deviations
 _BLOCK = 4  # consecutive motions whose errors may depend on each other
 _KERNEL = 2.0  # normalized residual at which a motion has half its weight
 _MOVING = 0.2  # share of the length of a fast motion below which wheels are taken to stand
@@ -59,7 +59,7 @@ def fitted(residuals: Callable[[Vector], Matrix], first: Vector, prior: Vector) 
     """
     x, m, covariance = first, len(first), np.diag(prior**2)
     P = np.diag(prior**-2.0)
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         r, step = residuals(x), 1e-6
         J = np.stack([(residuals(x + each) - r) / step for each in step * np.eye(m)], axis=-1)
         sigma = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9)
@@ -74,7 +74,7 @@ def fitted(residuals: Callable[[Vector], Matrix], first: Vector, prior: Vector) 
         covariance *= np.outer(larger, larger)
         step = -inverse @ (scores.sum(axis=0) + P @ (x - first))
         x = x + step
-        if np.all(np.abs(step) < _STEP * np.sqrt(covariance.diagonal())):
+        if np.all(np.abs(step) < STEP * np.sqrt(covariance.diagonal())):
             break
     return Fit(x, covariance)
 

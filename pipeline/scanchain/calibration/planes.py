@@ -11,13 +11,13 @@ import numpy as np
 from scipy.sparse import csr_matrix, hstack
 
 from scanchain import lie
+from scanchain.calibration.motions import STEP, STEPS
 from scanchain.data import Integers, Mask, Matrix, Points, Pose, Vector
 from scanchain.kernels.registration.plane_adjustment import LEAST_SLOPE, planes
 from scanchain.logs.messages.lidar import with_offsets
 from scanchain.odometry.elevation import kernel_scale
 from scanchain.preprocess import ScanMotion
 
-_STEPS, _STEP = 12, 0.02  # most Gauss-Newton steps; step of a converged parameter, in standard deviations
 _RIDGE = 1e-9  # regularizes planes and poses that few points constrain
 _REGION_CELLS = 8.0  # edge, in cells, of the regions whose errors count as independent
 _LEVEL = 0.7  # least vertical component of the normal of a level plane
@@ -122,7 +122,7 @@ def adjust(
     )
     found, covariance, inverse = np.zeros(m), np.diag(prior), np.zeros((m, m))
     known = list[tuple[Window, _Equations]]()
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         of_windows = [(each, _equations(each, found[:OFFSETS], T_others)) for each in windows]
         known = [(window, each) for window, each in of_windows if each is not None]
         if not known:
@@ -142,7 +142,7 @@ def adjust(
             window.poses[1:] = window.poses[1:] @ lie.exp(twists.reshape(-1, 6))
         found = found + step
         T_others = lie.exp(step[OFFSETS:].reshape(-1, 6)) @ T_others if len(T_others) else T_others
-        if np.all(np.abs(step) < _STEP * np.sqrt(covariance.diagonal())):
+        if np.all(np.abs(step) < STEP * np.sqrt(covariance.diagonal())):
             break
     for i in np.flatnonzero(~np.array(holds)):
         covariance[i, i] += _SYSTEMATIC[i] ** 2

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain.config import Config, LogConfig, PreprocessConfig
-from scanchain.data import BRIDGED_S, MOST_COPIES, Fixes, Scan, unit_of
+from scanchain.data import BRIDGED_S, GAP_INTERVALS, MOST_COPIES, Fixes, Scan, unit_of
 from scanchain.errors import counted
 from scanchain.files import Source
 from scanchain.logs.bad_scans import most_bad_scans
@@ -26,7 +26,6 @@ from scanchain.logs.mounting import Sensor
 from scanchain.logs.stream import whole_span
 from scanchain.range_noise import RangeNoise
 
-_GAP_PERIODS = 2.5  # longest time between scans, in periods, that is not a gap
 _LONG_GAP_S = (0.5, 10.0)  # longest gap over which the motion is predicted reliably, and with wheels
 _PARTS = (0.3, 1.2)  # scan duration over period outside which a time unit is implausible
 _FASTEST_M_S = 100.0  # speed from wheel odometry above which its unit is implausible
@@ -188,8 +187,8 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     logged_ns, stamps_ns = np.diff([seen.log_times_ns, seen.stamps_ns])  # scans logged in bursts have no gaps
     steps_s = 1e-9 * (np.minimum(logged_ns, stamps_ns) if stamps_ns.any() else logged_ns)
-    gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
-    periods = f"{_GAP_PERIODS:g} periods" + (f" of {seen.period_s:.3g} s" if seen.period_s else "")
+    gaps = np.flatnonzero(steps_s > GAP_INTERVALS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
+    periods = f"{GAP_INTERVALS:g} periods" + (f" of {seen.period_s:.3g} s" if seen.period_s else "")
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {periods}")
     longest = int(gaps[np.argmax(steps_s[gaps])])

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
-from scanchain.data import OtherPoints, Pose
+from scanchain.data import GAP_INTERVALS, OtherPoints, Pose
 from scanchain.errors import InputError, counted, duration
 from scanchain.logs.index import Channel, Decoded, FileIndex, name_of
 from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m, with_offsets
@@ -26,7 +26,6 @@ from scanchain.logs.stream import sampled_messages
 
 _TOGETHER_NS = 125_000_000  # longest time between a point and the middle of the scan it is added to
 _WAITING_NS = 2_000_000_000  # longest time between points that wait: the first lidar is missing, or a clock jumped
-_ABSENT = 2.5  # time without a lidar, in usual intervals between scans with it, above which it is missing
 
 
 def decoder(channel: Channel, times: PointTimes, plane_m: float | None) -> Callable[[memoryview], Returns]:
@@ -132,7 +131,7 @@ class OtherLidar:
         usual_ns = float(np.median(np.diff(times_ns[found]))) if len(found) > 1 else -1.0
         ends = np.array([-1, *found, len(self.scans)])
         begins_s, ends_s = 1e-9 * (times_ns - times_ns[0])[np.clip([ends[:-1], ends[1:]], 0, len(times_ns) - 1)]
-        is_absent = ends_s - begins_s > _ABSENT * 1e-9 * usual_ns
+        is_absent = ends_s - begins_s > GAP_INTERVALS * 1e-9 * usual_ns
         missed, k = int((np.diff(ends) - 1)[is_absent].sum()), int(np.argmax(ends_s - begins_s))
         lasted, after = duration(ends_s[k] - begins_s[k]), duration(begins_s[k])
         when = f"missing for up to {lasted}, {after} after the first scan"

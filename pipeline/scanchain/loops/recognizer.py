@@ -47,7 +47,7 @@ class Candidate:
 
     target : index of the older keyframe
     T_target_source : (d+1, d+1) initial pose of the queried keyframe in the target's frame, which verification
-        refines; it converges from a few voxels and about 20° off
+        refines; it converges from about two voxels or 10° off
     score : similarity, comparable between candidates of one recognizer; the larger the better
     proposed_by : appearance alone (``PLACE``) or together with the expected pose (``POSITION``); the latter is not
         tried where the target lies in another segment than the queried keyframe

@@ -16,7 +16,7 @@ from scanchain.back_end import BackEnd, Constraint
 from scanchain.config import Config
 from scanchain.data import Closure, ClosureVerdict, Keyframe, KeyframeErrors, Matrix, Pose
 from scanchain.errors import InputError, counted
-from scanchain.graph.factors import Odometry, edge_information
+from scanchain.graph.factors import Odometry
 from scanchain.loops import refined
 from scanchain.maps import Edges, SavedMap, open_saved_map
 
@@ -163,5 +163,4 @@ def _information(keyframes: Sequence[Keyframe], edges: Edges, order: Sequence[in
         if (j, i) in known:
             Ad = lie.adjoint(lie.between(keyframes[i].T_odom_lidar, keyframes[j].T_odom_lidar))
             result[n] = Ad.T @ known[j, i] @ Ad
-        result[n] = edge_information(result[n], *sigmas)
     return result

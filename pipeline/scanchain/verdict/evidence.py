@@ -11,13 +11,12 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from scanchain.data import LEAST_FIT, Matrix
+from scanchain.data import GAP_INTERVALS, LEAST_FIT, Matrix
 from scanchain.errors import FIRST
 
 Floats = NDArray[np.float64]
 
 KNOWN = 0.5  # least share of scans with a value of another sensor for it to count as known
-_LONG_GAP = 3.0  # multiple of the median interval above which the motion is not predicted
 _SMALL_RAD = 0.1  # difference of headings below which the text leaves it out
 
 
@@ -176,7 +175,7 @@ class Evidence:
     def is_after_gap(self) -> NDArray[np.bool_]:
         """(N,) scans after a gap in time over which the motion is not predicted."""
         intervals_s = np.diff(self.seconds, prepend=0.0)
-        return intervals_s > _LONG_GAP * np.median(intervals_s)
+        return intervals_s > GAP_INTERVALS * np.median(intervals_s)
 
     def segment(
         self, kind: str, part: slice, is_marked: NDArray[np.bool_], size_m: float | None = None,
