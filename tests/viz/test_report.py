@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from scanchain.__main__ import main
 from scanchain.comparison.table import COLUMNS, read_table
 from scanchain.maps import read_ply
-from scanchain.runs.metrics import Metrics
+from scanchain.runs.metrics import Metrics, summary
 from scanchain.verdict import Judged, Kind, Segment, Verdict
 from scanchain_viz.pictures.figure import Line
 from scanchain_viz.pictures.maps import surroundings
@@ -179,15 +179,17 @@ def test_the_verdict_stands_at_the_head_in_its_color_with_its_error_and_a_line_a
     assert ("otherwise ATE" in page) is (verdict is Verdict.CHECK)
 
 
-def test_an_error_bar_that_the_ground_truth_refutes_is_told_in_red_once(one_run, tmp_path, pages):
+def test_an_error_bar_that_the_ground_truth_refutes_is_told_in_red_and_in_the_summary(one_run, tmp_path, pages):
     metrics = msgspec.json.decode((one_run / "metrics.json").read_bytes(), type=Metrics)
     bar = msgspec.structs.replace(metrics.expected_ate_m, low=1.0, high=2.0)
-    refuted = msgspec.structs.replace(metrics, expected_ate_m=bar).refuted
+    wrong = msgspec.structs.replace(metrics, expected_ate_m=bar)
+    refuted = wrong.refuted
     assert refuted.startswith("the ground truth refutes the error bar: ATE 0.0")
     write_page(tmp_path, Page("title", "", refuted=refuted))
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count(f'<div class="warning refuted" role="alert">{refuted}</div>') == 1
-    assert metrics.refuted == "" and "refutes" not in pages["one_run"].read_text(encoding="utf-8")
+    assert f"\naccuracy       {refuted}\n" in summary(wrong, "", "", ())
+    assert metrics.refuted == "" and "refutes the error bar" not in pages["one_run"].read_text(encoding="utf-8")
 
 
 def test_the_same_directory_gives_the_same_page_without_matplotlib(pages):

@@ -286,6 +286,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         (_BY_STAGE[0], "".join(f"{stage:>12}" for stage in STAGES)),
         *((f"  {name}", "".join(f"{of[stage]:12.2f}" for stage in STAGES)) for name, of in stages.items()),
         *accuracy_lines(metrics.ground_truth),
+        *((("accuracy", metrics.refuted),) if metrics.refuted else ()),
         *(("warning", warning) for warning in metrics.warnings),
         *(("note", note) for note in notes),
     ])  # fmt: skip

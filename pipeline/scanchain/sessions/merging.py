@@ -138,8 +138,9 @@ def _opened(runs: Sequence[Path], out: Path) -> list[SavedMap]:
     for run, saved in zip(runs, maps, strict=True):
         if not len(saved.edges.pairs) and len(saved.keyframes) > 1:
             raise InputError(f"{run}: no edges join its keyframes, as in an imported map; merge takes runs")
+        owned = list(zip(saved.session.tolist(), saved.keyframes, strict=True))
         for number in range(len(saved.sessions)):
-            key = tuple(saved.keyframes[k].stamp_ns for k in (saved.session == number).nonzero()[0])
+            key = tuple(keyframe.stamp_ns for session, keyframe in owned if session == number)
             if key in holders:
                 raise InputError(f"{run}: holds a session that {holders[key]} also holds; leave one of them out")
             holders[key] = run
