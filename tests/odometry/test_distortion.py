@@ -21,7 +21,7 @@ SECONDS = 10
 @pytest.fixture
 def no_time_fields(monkeypatch):
     """Clouds are read as if they had no field of times."""
-    monkeypatch.setattr(point_times, "_NAMES", ())
+    monkeypatch.setattr(point_times.PointTimes, "fields", lambda self, names: [])
 
 
 def at_once():

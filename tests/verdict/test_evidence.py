@@ -86,8 +86,8 @@ def test_a_scan_is_contradicted_only_where_its_points_should_determine_its_pose(
     assert np.array_equal(found.is_contradicted, marked(100, 149) | marked(200, 249) | marked(300, 399))
 
 
-def test_a_gap_is_an_interval_of_more_than_three_usual_ones():
-    times_s = np.cumsum(np.where(np.arange(50) == 20, 0.62, np.where(np.arange(50) == 30, 0.58, INTERVAL_S)))
+def test_a_gap_is_an_interval_of_more_than_two_and_a_half_usual_ones():
+    times_s = np.cumsum(np.where(np.arange(50) == 20, 0.52, np.where(np.arange(50) == 30, 0.48, INTERVAL_S)))
     assert np.flatnonzero(evidence(POSES[:50], seconds=times_s).is_after_gap).tolist() == [20]
 
 
