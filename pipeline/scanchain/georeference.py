@@ -328,14 +328,10 @@ def _constrain(
 ) -> None:  # fmt: skip
     """Add a prior of the first pose, mainly of its tilt, and positions of keyframes (N,), about at these poses."""
     d, R = graph.dimension, T_enu_world[:3, :3]
-    information, R_up_lidar = (
-        np.eye(graph.freedom) * LARGEST_SIGMAS[0] ** -2.0,
-        upright(up) @ lie.lift(graph.poses[0])[:3, :3],
-    )
-    of_rotation = (
-        R_up_lidar.T @ np.diag(np.array([MOUNTED_RAD, MOUNTED_RAD, LARGEST_SIGMAS[1]]) ** -2.0) @ R_up_lidar
-    )
-    information[d:, d:] = of_rotation if d == 3 else LARGEST_SIGMAS[1] ** -2.0
+    free_m, free_rad = LARGEST_SIGMAS
+    information, R_up_lidar = np.eye(graph.freedom) * free_m**-2.0, upright(up) @ lie.lift(graph.poses[0])[:3, :3]
+    of_rotation = R_up_lidar.T @ np.diag(np.array([MOUNTED_RAD, MOUNTED_RAD, free_rad]) ** -2.0) @ R_up_lidar
+    information[d:, d:] = of_rotation if d == 3 else free_rad**-2.0
     graph.add_factor(Prior(), 0, information, graph.poses[0])
     at = lie.transform(lie.inverse(T_enu_world), sighted.enu_m)
     own = lie.lift(graph.poses[keyframes])

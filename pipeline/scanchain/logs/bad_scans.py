@@ -91,7 +91,7 @@ class ScanCounts:
         self.farthest_back_ns = self.begin_ns = 0
         self.publishers: dict[str, _Tally] = {}
         self.jumps_s, self.first_jump = list[float](), ""
-        self.first_complaint, self.odd, self.unset = "", list[str](), 0
+        self.first_complaint, self.first_odd, self.odd, self.unset = "", "", 0, 0
         self.steps_ns = [(0, 0)]  # steps of header stamp and log time from scan to scan, without jumps
         self._last: Scan | None = None
 
@@ -113,7 +113,8 @@ class ScanCounts:
         tally.messages += 1
         tally.with_returns += len(returns.points) > 0
         tally.end_ns = returns.stamp_ns
-        self.odd += filter(None, [returns.odd])
+        self.odd += bool(returns.odd)
+        self.first_odd = self.first_odd or returns.odd
         return tally.is_used
 
     def repeats(self, points: RawPoints) -> bool:
@@ -172,7 +173,7 @@ class ScanCounts:
             were = "was" if self.bad == 1 else "were"
             lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
         if self.odd:
-            lines.append(f"{self._share(len(self.odd))} contradict themselves (the first: {self.odd[0]})")
+            lines.append(f"{self._share(self.odd)} contradict themselves (the first: {self.first_odd})")
         if self.repeated > _MOST_REPEATED * self.scans:
             lines.append(
                 f"{self._share(self.repeated)} have the header stamp of the previous one: times in the results do "

@@ -93,7 +93,7 @@ class Log:
 
     Set by reading, once ``scans`` is exhausted or closed:
     bad_scans, scans_with_wheels : number of scans left out, and with a wheel reading near their stamp
-    wheels_late_s : how late the stamps of the wheels are if they are of another clock, else 0
+    wheels_late_s : delay of the stamps of the wheels where they are of another clock, else 0
     times : reader of the point times; jumps : warnings about jumps or a wrong rate of the header stamps
     together : the other lidars
     """

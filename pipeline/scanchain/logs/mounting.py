@@ -208,9 +208,8 @@ def find_mounting(
     broken = {
         f"{each.parent} → {each.child} is no pose (NaN, or a quaternion of zeros): correct it"
         for channel in (each for each in topics_of(indexes).values() if role(each) == "transforms")
-        for message in sampled_messages(indexes, channel.topic, reader(channel), span)
-        for each in message.value
-        if each.child in above and np.isnan(each.T_parent_child).any()
+        for each in _sampled(indexes, channel, span, are_poses=False)
+        if each.child in above
     }
     root = _root([each for each in fixed if not _is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
@@ -383,6 +382,9 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
     return found
 
 
-def _sampled(indexes: Sequence[FileIndex], channel: Channel, span: Span | None) -> list[StampedPose]:
+def _sampled(
+    indexes: Sequence[FileIndex], channel: Channel, span: Span | None, *, are_poses: bool = True
+) -> list[StampedPose]:
     sample = sampled_messages(indexes, channel.topic, reader(channel), span)
-    return [each for message in sample for each in message.value if np.isfinite(each.T_parent_child).all()]
+    found = (each for message in sample for each in message.value)
+    return [each for each in found if np.isfinite(each.T_parent_child).all() == are_poses]

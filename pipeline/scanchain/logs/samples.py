@@ -154,10 +154,11 @@ class Recorded:
             if topic == self.ground_truth_topic:
                 self.truth.append(sample)
             if topic in self.streams:
-                stamp_ns = sample.stamp_ns - self._delays_ns[topic]
-                self.streams[topic].add(sample._replace(stamp_ns=stamp_ns))
-                if self.streams[topic] is self.odometry:
-                    self._odometry_ns = stamp_ns - message.log_time_ns
+                if delay_ns := self._delays_ns[topic]:
+                    sample = sample._replace(stamp_ns=sample.stamp_ns - delay_ns)
+                self.streams[topic].add(sample)
+                if topic == self.odometry_topic:
+                    self._odometry_ns = sample.stamp_ns - message.log_time_ns
             if isinstance(sample, Fix):
                 self._fixes.append(sample)
 
@@ -177,7 +178,7 @@ class Recorded:
         return found
 
     def wheels_late_s(self) -> float:
-        """How late the stamps of the wheels are by log times (median), if they are of another clock; else 0."""
+        """Median delay in s of the stamps of the wheels by log times, where they are of another clock; else 0."""
         late_ns = np.array(self._late_ns or [0], np.float64)
         is_apart = np.ptp(late_ns) < NEAREST_NS < np.abs(late_ns).min()
         return 1e-9 * float(np.median(late_ns)) if is_apart else 0.0

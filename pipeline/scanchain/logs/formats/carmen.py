@@ -80,7 +80,7 @@ def _write(
 
     malformed : set to the number of the first malformed line and the count of malformed lines
     others : incremented by the number of lines of each unknown kind
-    guessed : extended by the numbers of beams that do not tell their angles
+    guessed : extended by the numbers of beams whose angles are assumed
     """
     parameters: dict[bytes, float] = {}
     scan_ns, is_mounted = 0, False

@@ -40,9 +40,9 @@ _PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
-_FEWEST_ROWS, _MOST_ROWS = 100, 10_000  # number of points of a .bin file that tell its columns
+_FEWEST_ROWS, _MOST_ROWS = 100, 10_000  # number of points of a .bin file from which its columns are inferred
 # shares of the variance between columns: that of the right number at least, and the most, over it, of a wrong one
-_APART, _ALIKE = 0.2, 0.5
+_DISTINCT, _AMBIGUOUS = 0.2, 0.5
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 _ONE_AT_A_TIME = Lock()  # for .npy headers: NumPy parses them with ast, which is not thread-safe in Python 3.11
@@ -271,7 +271,7 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
 
 
 def _columns(file: Path, stated: int) -> int:
-    """Number of columns of a .bin file: ``stated`` unless these are alike, and those of another number are not.
+    """Number of columns of a .bin file: ``stated``, or another number if only its columns are distinct.
 
     By the share of the variance of the logarithms that is between columns: with clouds of KITTI and PandaSet at
     least 0.34 for the right number, and at most 0.01 for one without a common divisor.
@@ -285,7 +285,7 @@ def _columns(file: Path, stated: int) -> int:
             float(rows.mean(axis=0).var() / max(rows.var(), 1e-12)) if len(rows) >= _FEWEST_ROWS else 0.0
         )
     best = next(count for count in shares if shares[count] >= 0.9 * max(shares.values()))
-    return best if shares.get(stated, 1.0) < _ALIKE * shares[best] and shares[best] > _APART else stated
+    return best if shares.get(stated, 1.0) < _AMBIGUOUS * shares[best] and shares[best] > _DISTINCT else stated
 
 
 def contents_of(

@@ -145,7 +145,7 @@ def frame_transform(message: _FrameTransform, link: Frames | None = None, dimens
 
 
 def frame_transforms(message: _FrameTransforms, **chosen: Any) -> list[StampedPose]:
-    """Transforms of a foxglove.FrameTransforms, as ``read_transforms`` returns them."""
+    """Transforms of a foxglove.FrameTransforms, all that are poses or, of any, those of the frames ``link``."""
     found = list[StampedPose]()
     for each in message.transforms:
         with suppress(*() if chosen.get("link") else (MalformedMessageError,)):
