@@ -48,6 +48,7 @@ from tests.benchmarks.place_odds import right, wrong
 from tests.benchmarks.places import PLACES, prepared, whole_of
 from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support import made
+from tests.support.drifting import drifting_slam, stretched
 from tests.support.scenes import DATA, ROOT
 
 PACKAGES = {"pipeline": "scanchain", "viz": "scanchain_viz"}
@@ -208,7 +209,11 @@ def tried(constant: Constant, names: list[str]) -> str:
 def slam_of(scans: Iterable[Scan], dimension: int, mounting: Matrix | None = None, **options: object) -> bytes:
     """Trajectories, graph, closures and verdict."""
     config = scanchain.load_settings(dimension, overrides=overrides_of(options)).config
-    slam = scanchain.Slam(config, mounting, dimension=dimension)
+    return result_of(scanchain.Slam(config, mounting, dimension=dimension), scans)
+
+
+def result_of(slam: scanchain.Slam, scans: Iterable[Scan]) -> bytes:
+    """Trajectories, graph, closures and verdict."""
     for scan in scans:
         slam.process(scan)
     result = slam.finish()
@@ -237,6 +242,13 @@ def of_world(world: str, sensor: str, scans: int, every: int = 1) -> Case:
         return slam_of(log, log.dimension)
 
     return case
+
+
+def of_drifting(folder: Path) -> bytes:
+    """A building whose odometry drifts by 3 % and 10 mrad/m."""
+    log = scanchain.open_log(DATA / "2d/mit_csail.mcap")
+    slam = drifting_slam(scanchain.load_settings(2).config, log.T_base_lidar, stretched(-0.03, 0.01))
+    return result_of(slam, log)
 
 
 def of_pairs(folder: Path) -> bytes:
@@ -369,6 +381,7 @@ CASES: dict[str, Case] = {
     "csail": of_log("2d/mit_csail.mcap", 400),
     "intel": of_log("2d/intel.mcap", 700),
     "mocap": of_log("2d/mocap_room_1.bag", 150),
+    "drifting": of_drifting,
     "lost in a building": of_log("2d/mit_csail.mcap", 300, range(60, 120), odometry__prior="constant-velocity"),
     "standing in a room": of_log("reports/rplidar_standing.bag", 100),
     "kitti": of_log("3d/kitti_0005_first60.mcap", 20),
