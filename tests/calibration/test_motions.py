@@ -1,5 +1,7 @@
 """Gyro and wheels against the motions of scans: mounting, scales and delays, and what a motion does not show."""
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,19 @@ def test_wheels_are_found_late_and_of_wrong_scales_and_the_lidar_where_it_is(dim
     error = lie.log(lie.between(T, found.T_base_lidar))
     assert np.abs(error[:2]).max() < 0.03 and np.abs(error[dimension:]).max() < 0.005
     assert len(sigmas) == 9
+
+
+def test_noise_of_the_wheels_is_not_taken_for_their_delay():
+    def error(seed):
+        rng = np.random.default_rng(seed)
+        steps = lie.log(lie.between(*(path(turns=False)[k:][:1999] for k in (0, 1))))
+        steps += rng.normal(0.0, [0.003, 0.0, 0.001], steps.shape)
+        wheels = np.array(list(accumulate(lie.exp(steps), np.matmul, initial=np.eye(3))))
+        motions = motions_of(path(turns=False), np.eye(3), rng)
+        fit = fit_wheels(motions, TIMES_S, wheels, np.eye(3)).fit
+        return fit.x[8] / fit.sigmas[8]
+
+    assert np.sqrt(np.mean(np.square([error(seed) for seed in range(12)]))) < 1.3
 
 
 def test_straight_ahead_neither_the_position_nor_the_scale_of_turns_is_observable():

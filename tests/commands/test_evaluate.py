@@ -37,7 +37,7 @@ def test_evaluate_prints_every_metric_with_its_definition(call, tree, tmp_path, 
     code, output, errors = call("evaluate", estimate, truth)
     assert code == 0
     (warning,) = errors.splitlines()
-    says(warning, "warning: far from the ground truth: ATE 0.89 m, 2.8 %")
+    says(warning, "warning: far from the ground truth: ATE 0.89 m on a path of 31.4 m")
     heads, units, *rows = (line.split() for line in output.splitlines()[1:9])
     assert heads == ["ATE", "RPE", "1", "pose", "RPE", "1", "s", "RPE", "10", "m"] and units == ["m", "deg"] * 4
     assert [row[0] for row in rows] == ["rmse", "mean", "median", "std", "min", "max"]
@@ -94,6 +94,20 @@ def test_evaluate_agrees_with_the_run_and_puts_several_estimates_into_a_table_an
         assert row.split()[4] == f"{rmse_m:.4f}"
     assert tree(run.folder / "trajectory.tum", truth) == found[str(run.folder)]
     says(refused("evaluate", run.folder, truth, "--png", png), "paths.png: exists")
+
+
+def test_evaluate_warns_of_a_truth_that_stands_and_refuses_kitti_files_of_different_lengths(
+    call, refused, tmp_path
+):
+    truth = quarter(tmp_path / "gt.tum")
+    standing = "".join(f"{100 + k}.0 {k % 2}e-3 {k % 3}e-3 0 0 0 0 1\n" for k in range(40))
+    (tmp_path / "standing.tum").write_text(standing)
+    says(call("evaluate", truth, tmp_path / "standing.tum")[2], "on a path of 0.1 m", "or does not move")
+    rows = "1 0 0 {} 0 1 0 0 0 0 1 0\n"
+    for name, count in (("est.txt", 30), ("gt.txt", 29)):
+        (tmp_path / name).write_text("".join(rows.format(k) for k in range(count)))
+    said = refused("evaluate", tmp_path / "est.txt", tmp_path / "gt.txt", "--kitti")
+    says(said, "gt.txt: has 29 lines for 30 scans")
 
 
 def test_evaluate_says_which_metric_a_short_way_leaves_out(call, tree, tmp_path):

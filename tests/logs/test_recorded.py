@@ -140,6 +140,18 @@ def test_foxglove_poses_and_transforms_are_wheels_and_mounting(tmp_path, form):
     np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
 
 
+def test_a_foxglove_transform_that_is_no_pose_is_named(tmp_path):
+    told = {"timestamp": {"sec": 5, "nsec": 0}, "parent_frame_id": "base_link", "child_frame_id": "laser"}
+    told |= {"translation": {"x": np.nan, "y": 0.0, "z": 0.0}, "rotation": dict(x=0.0, y=0.0, z=0.0, w=1.0)}
+    context = recorders.Context()
+    with recorders.open_mcap(tmp_path / "a.mcap", context=context):
+        scan = recorders.foxglove_scan(recorders.planar(1)[0])
+        recorders.LaserScanChannel("/lidar", context=context).log(scan, log_time=STAMP_NS)
+        json_channel("foxglove.FrameTransform", "/tf_static", context).log(told, log_time=STAMP_NS)
+    log = open_log(tmp_path / "a.mcap")
+    assert log.stated_mounting is None and "base_link → laser is no pose" in log.notes[0]
+
+
 def json_channel(name, topic, context):
     schema = Schema(name=name, encoding="jsonschema", data=b'{"type": "object"}')
     return Channel(topic, schema=schema, message_encoding="json", context=context)

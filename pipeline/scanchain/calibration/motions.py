@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import uniform_filter1d
 
 from scanchain import lie
 from scanchain.data import Mask, Matrix, Pose, Vector
@@ -19,7 +20,7 @@ _KERNEL = 2.0  # normalized residual at which a motion has half its weight
 _MOVING = 0.2  # share of the length of a fast motion below which wheels are taken to stand
 _GYRO_PRIOR = np.array([0.2] * 3 + [0.1] * 3 + [0.2])  # σ of rotation, bias and delay
 _WHEELS_PRIOR = np.array([1.0, 1.0, 0.2, 0.2, 0.2, 0.2, 0.2, 0.05, 0.3])  # of the parameters of ``Wheels``
-_MOST_SYSTEMATIC_S = 0.015  # σ of the delay by the averaging of wheels, at most
+_SMOOTHED = 5  # motions over which rates are averaged whose changes show a delay
 _LARGEST = 0.5  # error of the scale of distances above which wheels and scans are not of one motion
 _CLOCK_S = 0.002  # σ of the instants of poses: scans are deskewed at constant velocity
 # σ that the residuals do not show: angles and scale of the scans' own poses, the clock
@@ -49,28 +50,34 @@ class Fit(NamedTuple):
         return np.sqrt(self.covariance.diagonal())
 
 
-def fitted(residuals: Callable[[Vector], Matrix], first: Vector, prior: Vector) -> Fit:
+def fitted(
+    residuals: Callable[[Vector], Matrix], first: Vector, prior: Vector, slopes: Matrix | None = None
+) -> Fit:
     """Robust least squares (Cauchy) of residuals (M, q), whose derivatives are numerical.
 
     Each component is normalized by its median. The covariance is that of a sandwich estimator over blocks of
     consecutive motions, since two share the error of the pose between them, and no less than the usual one.
 
     prior : (m,) standard deviations around ``first``, which determine what the motions do not
+    slopes : (M, q) derivatives with respect to the last parameter without the noise of the residuals, which would
+        seem to determine it: instrumental variables (https://en.wikipedia.org/wiki/Instrumental_variables_estimation)
     """
     x, m, covariance = first, len(first), np.diag(prior**2)
     P = np.diag(prior**-2.0)
     for _ in range(STEPS):
         r, step = residuals(x), 1e-6
         J = np.stack([(residuals(x + each) - r) / step for each in step * np.eye(m)], axis=-1)
-        sigma = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9)
-        r, J = r / sigma, J / sigma[:, None]
+        sigma = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-5)
+        Z = J if slopes is None else np.concatenate([J[..., :-1], slopes[..., None]], axis=-1)
+        r, J, Z = r / sigma, J / sigma[:, None], Z / sigma[:, None]
         weight = 1.0 / (1.0 + np.mean(r**2, axis=1) / _KERNEL**2)
-        scores = np.einsum("mqi,mq,m->mi", J, r, weight)
-        inverse = np.linalg.inv(np.einsum("mqi,mqj,m->ij", J, J, weight) + P)
+        scores = np.einsum("mqi,mq,m->mi", Z, r, weight)
+        inverse = np.linalg.inv(np.einsum("mqi,mqj,m->ij", Z, J, weight) + P)
         blocks = np.add.reduceat(scores, np.arange(0, len(scores), _BLOCK))
         count = len(blocks)
-        covariance = inverse @ (count / max(count - m, 1) * blocks.T @ blocks + P) @ inverse
-        larger = np.sqrt(np.maximum(inverse.diagonal() / covariance.diagonal(), 1.0))
+        covariance = inverse @ (count / max(count - m, 1) * blocks.T @ blocks + P) @ inverse.T
+        usual = inverse @ (np.einsum("mqi,mqj,m->ij", Z, Z, weight) + P) @ inverse.T
+        larger = np.sqrt(np.maximum(usual.diagonal() / covariance.diagonal(), 1.0))
         covariance *= np.outer(larger, larger)
         step = -inverse @ (scores.sum(axis=0) + P @ (x - first))
         x = x + step
@@ -130,9 +137,13 @@ def fit_wheels(motions: Motions, times_s: Vector, poses: Matrix, T_base_lidar: P
         return None
     lengths, late_s = path_m(motions.T), likeliest(base.odds(*motions))
     first_s = late_s or 0.0  # where it is None, any delay fits
-    motions = motions.where(lengths > max(_MOVING * float(np.quantile(lengths, 0.9)), 1e-3))
-    if len(motions.T) < FEWEST:
+    is_moving = lengths > max(_MOVING * float(np.quantile(lengths, 0.9)), 1e-3)
+    if np.count_nonzero(is_moving) < FEWEST:
         return None
+    lasted_s = np.diff(motions.ends_s, axis=1)
+    rates = uniform_filter1d(lie.log(lie.lift(motions.T)) / lasted_s, _SMOOTHED, axis=0)
+    changes = (lasted_s * np.gradient(rates, motions.ends_s.mean(axis=1), axis=0))[is_moving]
+    motions = motions.where(is_moving)
     if T_base_lidar is None:
         moved = base.over(motions.ends_s, first_s)
         found = hand_eye(lie.lift(moved) if motions.T.shape[-1] == 4 else moved, motions.T)
@@ -148,8 +159,8 @@ def fit_wheels(motions: Motions, times_s: Vector, poses: Matrix, T_base_lidar: P
     def residuals(x: Vector) -> Matrix:
         T = mounting(x)
         by_scans = lie.log(T @ lie.lift(motions.T) @ lie.inverse(T))
-        by_scans *= lie.by_component(6, 1.0 + x[5], 1.0 + x[6])
-        by_scans[:, 5] += x[7] * by_scans[:, 0]
+        by_scans[:, :3] *= 1.0 + x[5]
+        by_scans[:, 5] = (1.0 + x[6]) * by_scans[:, 5] + x[7] * by_scans[:, 0]
         error = lie.log(lie.between(lie.exp(by_scans), lie.lift(base.over(motions.ends_s, x[8]))))
         return error[:, [0, 1, 5]] if is_planar else error
 
@@ -158,12 +169,13 @@ def fit_wheels(motions: Motions, times_s: Vector, poses: Matrix, T_base_lidar: P
     first = np.array([0.0] * 8 + [first_s])
     noise, signal = residuals(first)[:, -1], lie.log(motions.T)[:, -1]
     prior[8] = prior[8] if late_s is not None else 1e-6
-    fit = fitted(residuals, first, prior)
+    slopes = changes @ lie.adjoint(lie.lift(T_first)).T
+    fit = fitted(residuals, first, prior, slopes[:, [0, 1, 5]] if is_planar else slopes)
     if abs(fit.x[5]) > _LARGEST:
         return None
     systematic = _OF_WHEELS.copy()
     systematic[6] += float(np.median(noise**2) / max(np.mean(signal**2), 1e-12))  # attenuation by noise
-    systematic[8] += MOST_DELAY_S if late_s is None else min(0.25 * base.width_s, _MOST_SYSTEMATIC_S)
+    systematic[8] += MOST_DELAY_S if late_s is None else 0.0
     fit = Fit(fit.x, fit.covariance + np.diag(systematic**2))
     T = mounting(fit.x)
     return Wheels(lie.flatten(T) if is_planar else T, fit)

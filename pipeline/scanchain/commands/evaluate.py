@@ -43,7 +43,11 @@ if TYPE_CHECKING:
     metavar="LIST",
     help="Intervals of the RPE in poses, seconds or meters, comma-separated.",
 )
-@click.option("--kitti", is_flag=True, help="All files are KITTI's, 12 numbers a line; poses pair line by line.")
+@click.option(
+    "--kitti",
+    is_flag=True,
+    help="All files are KITTI's, 12 numbers a line; poses pair line by line, so that their numbers are equal.",
+)
 @click.option("--png", metavar="FILE", type=PATH, help="Draw the estimates, aligned, over the ground truth.")
 @options.force("an existing picture")
 @click.option("--verbose", is_flag=True, help="Print the definitions of the figures, too; --json holds them.")
@@ -103,15 +107,15 @@ def _evaluated(
     estimate: Path, gt: Path | None, relations: Path | None, kitti: bool, given: dict[str, Any]
 ) -> Results:
     """Every metric of a file, or of a run directory."""
-    from scanchain.evaluation import read_relations, read_truth, relation_error
+    from scanchain.evaluation import TruthFile, read_relations, read_truth, relation_error
     from scanchain.evaluation.metrics import Results, evaluate
     from scanchain.trajectory import read_kitti, read_tum
 
     trajectory = read_kitti(estimate) if kitti else read_tum(estimate)
     results = Results({}, {})
     if gt is not None:
-        truth = read_kitti(gt) if kitti else read_truth(gt).at(trajectory.stamps_ns)
-        results = evaluate(trajectory, truth, **given)
+        truth = TruthFile(gt, read_kitti(gt), has_stamps=False) if kitti else read_truth(gt)
+        results = evaluate(trajectory, truth.at(trajectory.stamps_ns), **given)
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     return results

@@ -177,9 +177,9 @@ class AbsoluteError(Metric):
         )
 
 
-def far_off(ate_rmse_m: float, share: float | None, path_length_m: float, rotation_rmse_rad: float) -> str:
+def far_off(ate_rmse_m: float, path_length_m: float, rotation_rmse_rad: float) -> str:
     """Warning that an ATE is too large for odometry that works, or only its rotations; empty where neither is."""
-    if share is None or share <= _FAR_OFF[0] or ate_rmse_m <= _FAR_OFF[1]:
+    if ate_rmse_m <= max(_FAR_OFF[0] * path_length_m, _FAR_OFF[1]):
         if rotation_rmse_rad <= _FAR_OFF_RAD:
             return ""
         return (
@@ -187,9 +187,9 @@ def far_off(ate_rmse_m: float, share: float | None, path_length_m: float, rotati
             "are not: it has none, or those of other axes (a camera's), which rotations, RPE and KITTI compare"
         )
     return (
-        f"far from the ground truth: ATE {ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
-        f"{path_length_m:.1f} m; above {100.0 * _FAR_OFF[0]:g} % a trajectory is wrong somewhere, or the truth "
-        "is in another unit, uses another clock or follows another body"
+        f"far from the ground truth: ATE {ate_rmse_m:.2f} m on a path of {path_length_m:.1f} m; above "
+        f"{100.0 * _FAR_OFF[0]:g} % a trajectory is wrong somewhere, or the truth is in another unit, uses "
+        "another clock, follows another body or does not move"
     )
 
 

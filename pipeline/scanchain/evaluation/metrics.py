@@ -185,7 +185,7 @@ def evaluate(
     factor = scale_of(pairs) if scale else 1.0
     pairs = scaled(pairs, factor)
     ate = absolute_error(pairs, Alignment(align))
-    complaint = far_off(ate.translation_m.rmse, ate.share_of_path, ate.path_length_m, ate.rotation_rad.rmse)
+    complaint = far_off(ate.translation_m.rmse, ate.path_length_m, ate.rotation_rad.rmse)
     warnings = [complaint, *pairs.warnings] if complaint else pairs.warnings
     aligned = ate.T_reference_estimate @ pairs.estimate
     errors, missing = relative_errors(pairs, intervals)

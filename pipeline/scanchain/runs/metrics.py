@@ -63,7 +63,7 @@ class GroundTruth(Struct, frozen=True):
     def complaint(self) -> str:
         """Warning that the trajectory is far from the ground truth; empty if it is not."""
         error, length_m = self.optimized, self.path_length_m
-        return far_off(error.ate_rmse_m, error.ate_share_of_path, length_m, error.ate_rotation_rmse_rad)
+        return far_off(error.ate_rmse_m, length_m, error.ate_rotation_rmse_rad)
 
 
 class Metrics(Struct, frozen=True):

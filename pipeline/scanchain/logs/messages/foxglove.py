@@ -136,21 +136,22 @@ def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
 
 
 def frame_transform(message: _FrameTransform, link: Frames | None = None, dimension: int = 3) -> list[StampedPose]:
-    """A foxglove.FrameTransform, flattened for dimension 2; none if it is not between the frames of ``link``."""
+    """A foxglove.FrameTransform, flattened for dimension 2; none if it is not between the frames of ``link``.
+
+    Raises MalformedMessageError for one of the link that is no pose; another that is none is NaN.
+    """
     frames = frame_name(message.parent_frame_id), frame_name(message.child_frame_id)
     if link not in (None, frames):
         return []
-    pose = _pose(message.translation, message.rotation, dimension)
-    return [StampedPose(_stamp_ns(message.timestamp), *frames, pose)]
+    T = np.full((dimension + 1, dimension + 1), np.nan)
+    with suppress(*() if link else (MalformedMessageError,)):
+        T = _pose(message.translation, message.rotation, dimension)
+    return [StampedPose(_stamp_ns(message.timestamp), *frames, T)]
 
 
 def frame_transforms(message: _FrameTransforms, **chosen: Any) -> list[StampedPose]:
-    """Transforms of a foxglove.FrameTransforms, all that are poses or, of any, those of the frames ``link``."""
-    found = list[StampedPose]()
-    for each in message.transforms:
-        with suppress(*() if chosen.get("link") else (MalformedMessageError,)):
-            found += frame_transform(each, **chosen)
-    return found
+    """Transforms of a foxglove.FrameTransforms, as those of single ones."""
+    return [found for each in message.transforms for found in frame_transform(each, **chosen)]
 
 
 def location_fix(message: _LocationFix) -> Fix:
