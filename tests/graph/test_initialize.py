@@ -4,6 +4,9 @@ import pytest
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.factors import Position
+from scanchain.graph.initialize import (
+    _nearest_rotation as nearest_rotation,
+)
 from scanchain.graph.initialize import first_guess, follow_odometry, follow_spanning_tree, relax_chordally
 from scanchain.graph.problem import GraphProblem
 from tests.support.graphs import BEST, PLAIN, graph_of, published
@@ -33,6 +36,12 @@ def test_initial_poses_come_from_positions_in_the_world_alone(dimension, initial
     done = graph.optimize(GraphConfig(robust="none"), initialize=initialize)
     assert done.chi2_before > 1.0 and done.iterations <= 1
     assert np.allclose(graph.poses, true, atol=1e-6)
+
+
+def test_the_nearest_rotation_is_none_that_reflects():
+    turned = lie.exp(np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.9]))[:3, :3]
+    found = nearest_rotation(np.stack([0.5 * turned, turned @ np.diag([2.0, 1.0, -0.1])]))
+    np.testing.assert_allclose(found, [turned, turned], atol=1e-12)
 
 
 EDGES = np.array([(0, 1), (2, 1), (2, 3), (4, 3), (4, 5), (5, 6), (0, 4), (6, 1), (2, 5)])

@@ -35,6 +35,24 @@ def test_a_fixed_pose_stays_to_the_bit():
     assert not np.array_equal(graph.poses[0], before[0])
 
 
+def test_a_rejected_edge_is_not_in_force_and_has_no_degrees_of_freedom(dimension):
+    graph, _ = ring(dimension, noise=0.01)
+    before = graph.state().degrees_of_freedom
+    T_wrong = lie.exp(np.full(lie.twist_size(lie.identity(dimension)), 2.0))
+    graph.add_edge(0, 7, T_wrong, 1e4 * np.eye(len(graph.information[0])), is_loop=True)
+    graph.optimize(GraphConfig(robust="truncated"))
+    assert graph.is_rejected.tolist() == [False] * (len(graph.edges) - 1) + [True]
+    assert graph.state().degrees_of_freedom == before
+    assert np.array_equal(graph.in_force(0, len(graph)).edges, graph.edges[:-1])
+
+
+def test_poses_added_to_named_ones_have_the_numbers_after_the_largest_name():
+    graph = PoseGraph(2, np.array([7, 40, 3]))
+    for k in range(5):
+        graph.add_pose(lie.identity(2), k)
+    assert graph.names.tolist() == [7, 40, 3, 41, 42]
+
+
 @pytest.mark.parametrize("first", [0, 12, 18, 40, 60])
 def test_edges_added_are_corrected_as_among_all_others(first):
     graph, _ = ring(2, count=60, noise=0.03)
