@@ -9,7 +9,15 @@ from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Proposal
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import _OF_FIND as FOUND
-from scanchain.loops.evidence import LARGEST_RATIO, SequentialPlaceTest, compared, features, is_in_sight, log_ratio
+from scanchain.loops.evidence import (
+    LARGEST_RATIO,
+    SequentialPlaceTest,
+    compared,
+    features,
+    is_in_sight,
+    log_ratio,
+    pose_by,
+)
 from scanchain.odometry.odometry import first_match
 from tests.support.graphs import graph_of
 from tests.support.scenes import configured, square, stored
@@ -40,6 +48,18 @@ def up_to(index, keyframes):
 def tried(*sources, y_m=0.0, overlap=0.95, verdict=ClosureVerdict.ACCEPTED):
     match = first_match(lie.pose_2d(0.0, y_m, 0.0), np.empty((0, 2)), configured(2).matching)
     return [Closure(0, source, match, overlap, verdict, "") for source in sources]
+
+
+def test_a_closure_places_a_later_keyframe_along_the_odometry_since_its_source():
+    keyframes = keyframes_in([4.0] * 4)
+    T_source, ahead, T_target = (
+        lie.pose_2d(*each) for each in ((1.0, 2.0, 0.5), (2.0, 0.3, 0.4), (5.0, 0.0, 1.0))
+    )
+    for k, T in ((3, T_source), (5, T_source @ ahead)):
+        keyframes[k] = replace(keyframes[k], T_odom_lidar=T)
+    (closure,) = tried(3, y_m=0.7)
+    found = pose_by(closure, 5, keyframes, np.array([T_target]))
+    np.testing.assert_allclose(found, T_target @ lie.pose_2d(0.0, 0.7, 0.0) @ ahead, atol=1e-12)
 
 
 def test_keyframes_that_fit_one_place_join_a_log_to_a_map_once_they_are_enough():
