@@ -10,8 +10,6 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.growing_array import GrowingArray
 from scanchain.kernels.graph.paths import path_lengths
 
-_LOOP_LENGTH_M = 1e-3  # length of a loop edge in the shortest path: it adds next to no drift
-
 
 class Segments:
     """The segments of a trajectory; each ends where the motion to the next keyframe is unknown."""
@@ -65,7 +63,7 @@ class Drift:
     """Position uncertainty between keyframes: the drift of odometry along the shortest path that connects them.
 
     The length of an edge is that of its translation or, where odometry was more uncertain, that of a path with a
-    drift equal to the edge's standard deviation.
+    drift equal to the edge's standard deviation; loops have none, as they add next to no drift.
     """
 
     def __init__(self, drift: float) -> None:
@@ -83,7 +81,7 @@ class Drift:
         new = slice(len(self.lengths), len(graph.edges))
         d = graph.dimension
         measurements, information = graph.added_since(len(self.lengths))
-        lengths, is_odometry = np.where(graph.is_loop[new], _LOOP_LENGTH_M, np.inf), graph.is_odometry[new]
+        lengths, is_odometry = np.where(graph.is_loop[new], 0.0, np.inf), graph.is_odometry[new]
         covariances = np.linalg.inv(information[is_odometry])
         sigmas_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
         translations_m = np.linalg.norm(measurements[is_odometry, :d, d], axis=1)

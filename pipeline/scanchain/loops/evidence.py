@@ -31,7 +31,7 @@ _NO_OVERLAP = 0.3  # overlap above which a match is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of points in view of the other keyframe for which the comparison counts in full
 _LATEST = 10  # number of last counted keyframes on which the next one may depend
 _INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path beyond which two keyframes are independent, at full scale
-_AGREE = (1.0, 0.1)  # m at full scale and rad, largest difference between the poses that two closures imply
+AGREE = (1.0, 0.1)  # m at full scale and rad, largest difference between the poses that two closures imply
 
 
 def compared(
@@ -234,7 +234,7 @@ class SequentialPlaceTest:
     def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
         """True if a closure implies the same pose of its source as the first waiting one."""
         T, T_other = (pose_by(each, closure.source, keyframes, T_world) for each in (self.waiting[0], closure))
-        return lie.agree(T, T_other, _AGREE[0] * keyframes[closure.source].scale, _AGREE[1])
+        return lie.agree(T, T_other, AGREE[0] * keyframes[closure.source].scale, AGREE[1])
 
 
 def log_ratio(closure: Closure, agreeing: int, contradicting: int, points: int) -> float:

@@ -18,6 +18,7 @@ from scanchain.config import Config, LocalMapConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.errors import InputError
 from scanchain.files import write_whole
+from scanchain.loops.evidence import AGREE
 from scanchain.loops.place_search import Underway, candidates, completed
 from scanchain.loops.recognizer import PLACE_DRIFT, Candidate, Query
 from scanchain.loops.submaps import Submap, level_frame, seen_together, upright_frame
@@ -50,7 +51,6 @@ _PER_SCAN = 3  # number of poses that are verified per scan
 _MIN_AGREEMENT = 0.8  # least free-space agreement with a map of another day: cars and people differ
 _REACH_IN_MAP = 0.5  # radii of a submap from the map's keyframes, beyond which nothing is verified
 _LEVEL_M, _MAX_LEVELS = 2.0, 3  # least difference in height of two stories, and number of them that are tried
-_AGREE = (1.0, 0.05)  # m and rad, largest difference between the poses that two closures imply
 _AMBIGUOUS = Problem.plain("another location in the map is as similar")
 
 # of the outline of a map
@@ -197,7 +197,7 @@ class UprightMap:
         if not accepted:
             return tried[0][0] if tried else None
         best, T_best = max(accepted, key=lambda each: each[0].overlap)
-        return best if all(lie.agree(T_best, T, *_AGREE) for _, T in accepted) else best.rejected(_AMBIGUOUS)
+        return best if all(lie.agree(T_best, T, *AGREE) for _, T in accepted) else best.rejected(_AMBIGUOUS)
 
     def is_repeated(self, members: Sequence[Keyframe]) -> bool:
         """True if the structure around some keyframes is found at several locations in the map."""

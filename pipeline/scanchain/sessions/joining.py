@@ -293,12 +293,10 @@ def repeated_paths(
     guest: Sequence[Keyframe],
     agreeing: NDArray[np.int64],
     config: Config,
-    most: int = _SEARCHED,
 ) -> tuple[int, int]:
     """Numbers of agreeing paths of the guest that also fit elsewhere in either map, and of those tested.
 
     agreeing : numbers of the guest's keyframes that agree with the host; both in one frame
-    most : largest number of paths, evenly spread over those that agree
     """
     searches = [PlanarMapSearch(part, config.local_map.voxel_size_m) for part in (host, guest)]
     traveled_m = np.array([keyframe.traveled_m for keyframe in guest]) - guest[0].traveled_m
@@ -307,7 +305,7 @@ def repeated_paths(
     begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
     ends = np.unique(np.searchsorted(traveled_m, [begin_m, begin_m + length_m]), axis=1).T.tolist()
     paths = [range(*each) for each in ends if np.isin(range(*each), agreeing).sum() > _AGREEING * np.diff(each)]
-    paths, repeated = paths[:: max(-(-len(paths) // most), 1)], 0
+    paths, repeated = paths[:: max(-(-len(paths) // _SEARCHED), 1)], 0
     for path in paths:
         members = [guest[index] for index in path]
         fits = [fit for search in searches if (fit := search.likely(members)) is not None]

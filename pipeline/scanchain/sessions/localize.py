@@ -20,6 +20,7 @@ from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Pose, brief
 from scanchain.errors import FIRST, InputError, counted
 from scanchain.logs import Log
+from scanchain.loops.evidence import SEARCHED_M
 from scanchain.maps import SavedMap
 from scanchain.runs.directory import POINTS_FILE, RunDirectory, write_figures
 from scanchain.runs.job import Job, Progress
@@ -33,10 +34,8 @@ from scanchain.trajectory import read_tum, write_tum
 from scanchain.verdict import Judged, Verdict, merged
 
 LOCALIZATION_FILE = "localization.parquet"
-_SHORT_M = {2: 5.0, 3: 20.0}  # path of a log below which not being found in the map proves nothing
 _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without a match with the map that is reported
 _MOVED = (0.3, 5.0)  # m and σ, least reported difference of the live and the final pose of a scan
-_PATHS = 12  # largest number of paths of the log that are searched for elsewhere in the end
 _APART_S = 1.0  # largest time between the first scan and the nearest pose of a file
 _AMBIGUOUS_SHARE = 0.5  # least share of ambiguous searches for which a log that is not found is called ambiguous
 
@@ -269,7 +268,7 @@ def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
     placed = [replace(each, T_odom_lidar=found.trajectory.poses[each.scan_index]) for each in chosen]
     sources = graph.edges[graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < of_map), 1]
     agreeing = np.flatnonzero(np.isin([each.index for each in chosen], sources))
-    repeated, paths = repeated_paths(prior.keyframes, placed, agreeing, config, _PATHS)
+    repeated, paths = repeated_paths(prior.keyframes, placed, agreeing, config)
     if repeated <= MAX_REPEATED * paths:
         return ""
     return f"{repeated} of {paths} paths in it also fit other locations"
@@ -281,7 +280,7 @@ def _verdict(
     scans, path_m, log_odds = len(found.states), float(found.traveled_m[-1]), found.result.map_log_odds
     tried = f"{counted(scans, 'scan')} over {path_m:.1f} m"
     if not found.is_placed.any():
-        if path_m < _SHORT_M[found.trajectory.dimension]:
+        if path_m < SEARCHED_M[found.trajectory.dimension]:
             reason = f"not found in {prior.name}: {tried} are too short a path to decide"
         elif np.isfinite(log_odds):
             reason = f"not certain: {tried} may be in {prior.name}, but log-odds of {log_odds:.1f} are too low"
