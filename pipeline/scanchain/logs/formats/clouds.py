@@ -27,6 +27,7 @@ from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # unit of a stamp by its number of digits, for stamps after 2001
+_DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)[T_ -]?(\d\d)[-:._]?(\d\d)[-:._]?(\d\d)(?:[.,_-](\d{1,9}))?Z?$")
 
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
 XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
@@ -319,10 +320,15 @@ def stamp_of_name(stem: str) -> int | None:
     """Stamp in nanoseconds in a file's name, None if there is none.
 
     Supported are nano-, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a fraction
-    (``12.375``), and seconds and nanoseconds separately (``cloud_1583836591_182590976``).
+    (``12.375``), seconds and nanoseconds separately (``cloud_1583836591_182590976``), and dates with a time of day,
+    as UTC (``2011-09-26_14-14-10.25``, ``20110926_141410_250``).
     """
     stamp_ns = LATEST_NS
-    if match := re.search(r"(?<!\d)(\d{1,10})\.(\d{1,9})$", stem):
+    if match := _DATE.search(stem):
+        with suppress(ValueError):
+            date = np.datetime64("{}-{}-{}T{}:{}:{}".format(*match.groups()), "s")
+            stamp_ns = int(date.astype(np.int64)) * 1_000_000_000 + int((match[7] or "0").ljust(9, "0"))
+    elif match := re.search(r"(?<!\d)(?<!\d\d[-:]\d\d[-:])(\d{1,10})\.(\d{1,9})$", stem):
         stamp_ns = int(match[1]) * 1_000_000_000 + int(match[2].ljust(9, "0"))
     elif match := re.search(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$", stem):
         stamp_ns = int(match[1]) * 1_000_000_000 + int(match[2])
