@@ -280,8 +280,12 @@ MAST = ("mast", 1.0, 0.0, np.pi / 2, 0.0)
             (0.5, 0.0, 0.0), "chassis", "",
         ),
         ([("map", "mast", 9.0, 0.0, 0.0, 0.0), LASER], None, (0.5, 0.0, 0.0), "mast", "mast is used as the base"),
+        (
+            [("base_link", *MAST), LASER], "camera_pose", (1.0, 0.5, np.pi / 2), "base_link",
+            "no transform states where camera_pose is, whose odometry is taken as that of base_link",
+        ),
     ],
-    ids=["chained", "no chain", "root of the tree", "frame of the wheels", "below the world"],
+    ids=["chained", "no chain", "root of the tree", "frame of the wheels", "below the world", "wheels elsewhere"],
 )  # fmt: skip
 def test_the_mounting_is_that_of_the_static_transforms(tmp_path, entries, wheels_of, expected, base, note):
     said = [transforms_said(STAMP_NS, transforms(*entries)), one_scan(0.1, 0.1)]
@@ -290,6 +294,13 @@ def test_the_mounting_is_that_of_the_static_transforms(tmp_path, entries, wheels
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(*expected), atol=1e-12)
     assert log.mounting.base == base
     assert note in log.notes[0] if note else log.notes == []
+
+
+@pytest.mark.parametrize(("frame", "is_fixed"), [("laser", False), ("camera_init", True), ("robot/odom", True)])
+def test_clouds_in_a_frame_that_does_not_move_with_the_lidar_are_a_warning(tmp_path, frame, is_fixed):
+    said = [scan_said(STAMP_NS + k, laser_scan(STAMP_NS + k, [1.0, 2.0], frame=frame)) for k in range(3)]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert [f"/scan is in the frame {frame}, which" in line for line in log.damage] == [True] * is_fixed
 
 
 @pytest.mark.parametrize("moving", [False, True])

@@ -12,6 +12,7 @@ from scanchain.data import FEWEST_COPIED, MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError, counted, duration
 from scanchain.logs.index import Decoded
 from scanchain.logs.messages.lidar import Returns
+from scanchain.logs.mounting import is_world
 from scanchain.logs.publishers import Publisher
 
 _MOST_REPEATED = 0.5  # share of repeated stamps above which they are a warning, not a note
@@ -168,6 +169,11 @@ class ScanCounts:
             f"{each.messages:,} of {total} of {self.topic} left out, from another publisher: {each.text}{used}"
             for each in tallies
             if not each.is_used
+        ]
+        lines += [
+            f"{self.topic} is in the frame {frame}, which by its name does not move with the lidar: if a SLAM has "
+            "registered the points, poses are only what it left to correct; choose the raw --topic"
+            for frame in filter(is_world, self.publishers)
         ]
         if self.bad:
             were = "was" if self.bad == 1 else "were"

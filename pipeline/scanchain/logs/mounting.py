@@ -93,9 +93,9 @@ def find_wheels(
         for each in _sampled(indexes, channel, span) if wanted in ("", channel.topic) else ():
             links.setdefault((each.parent, each.child), (channel, []))[1].append(each)
     parents = {each.child: each.parent for each in _transforms(indexes, is_fixed=True)}
-    parents |= {child: parent for parent, child in links if not _is_world(parent)}
+    parents |= {child: parent for parent, child in links if not is_world(parent)}
     robot = [frame, *_above(frame, parents)]
-    found = [(a, b) for a, b in links if "odom" in a.lower() and not _is_world(b) and b != frame]
+    found = [(a, b) for a, b in links if "odom" in a.lower() and not is_world(b) and b != frame]
     own = [link for link in found if link[1] in robot]
     if own or any(name.rpartition("/")[2] in _BASE_FRAMES for name in robot):
         found = own  # not those of other robots
@@ -202,7 +202,10 @@ def find_mounting(
         return Mounting(base_of_wheels, T, "by log.lidar_pose")
     bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
     if (stated := _stated(indexes, bases, frame, span)) is not None:
-        return stated
+        if base_of_wheels in ("", stated.base):
+            return stated
+        note = f"no transform states where {base_of_wheels} is, whose odometry is taken as that of {stated.base}"
+        return stated._replace(note="; ".join(filter(None, [stated.note, note])))
     fixed, rivals = _fixed(indexes)
     above = {frame, *_above(frame, {each.child: each.parent for each in fixed})}
     broken = {
@@ -211,7 +214,7 @@ def find_mounting(
         for each in _sampled(indexes, channel, span, are_poses=False)
         if each.child in above
     }
-    root = _root([each for each in fixed if not _is_world(each.parent)], frame)
+    root = _root([each for each in fixed if not is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is used as the base"
@@ -254,7 +257,7 @@ def _stated(indexes: Sequence[FileIndex], bases: Sequence[str], frame: str, span
             return Mounting(base, T_base_lidar, note=_disagreeing(fixed, rivals, base, frame))
     joints: dict[Frames, list[StampedPose]] = {}
     for each in _transforms(indexes, is_fixed=False, span=span):
-        if not _is_world(each.parent):
+        if not is_world(each.parent):
             joints.setdefault((each.parent, each.child), []).append(each)
     first = [*fixed, *(poses[0] for poses in joints.values())]
     for base in bases:
@@ -330,7 +333,8 @@ def _above(frame: str, parents: dict[str, str]) -> Iterator[str]:
         yield frame
 
 
-def _is_world(frame: str) -> bool:
+def is_world(frame: str) -> bool:
+    """True if by its name a frame is fixed to the world."""
     return not _WORLD_WORDS.isdisjoint(re.split(r"[/_]", frame.lower()))
 
 
