@@ -191,6 +191,10 @@ def test_wheels_that_turn_the_other_way_or_disagree_all_along_are_named(dimensio
     motions[:, [1, -1]] *= -1.0
     mirrored = judge(evidence(poses, wheels=wheels_of(chained(motions, np.random.default_rng(2)))))
     assert mirrored.verdict is Verdict.CHECK and "mirrored" in mirrored.reason
+    assert ("--log.upside_down" in mirrored.reason, "--log.lidar_pose" in mirrored.reason) == (
+        dimension == 2,
+        dimension == 3,
+    )
     evenly = judge(evidence(poses, wheels=wheels_of(poses, scale=1.4)))
     assert evenly.verdict is Verdict.CHECK and "mirrored" not in evenly.reason
     assert "wheels disagree with the trajectory all along" in evenly.reason

@@ -296,7 +296,7 @@ def _axes(X: Matrix, Y: Matrix, stated: Matrix | None) -> Iterator[tuple[Matrix,
     """
     H = Y.T @ X
     sign, turned = (
-        "the sign of its rates is wrong: corrected",
+        "the sign of its rates is wrong, or the scans are mirrored: the rates are corrected",
         "its axes are not those of the transforms: estimated",
     )
     candidates = [] if stated is None else [(stated, ()), (-stated, (sign,))]

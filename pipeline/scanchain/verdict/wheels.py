@@ -151,9 +151,11 @@ class Wheels(Check):
     def warnings(self, evidence: Evidence) -> Iterator[str]:
         """Wheels that turn opposite, or that disagree throughout by more than the largest σ learned for them."""
         if self.turn_ratio < -hand_eye.OPPOSED:
+            in_space = 'lidar_pose "x y z 1 0 0 0", or points of left-handed axes'
+            flag = "upside_down true" if evidence.poses.shape[-1] == 3 else in_space
             yield (
                 "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down "
-                "that /tf_static does not state so: --log.upside_down true), or the wheels are"
+                f"that /tf_static does not state so: --log.{flag}), or the wheels are"
             )
         known = np.isfinite(self.values)
         if not known.any() or np.median(self.values[known]) <= _MEDIAN_LIMIT:
