@@ -184,6 +184,22 @@ def test_a_name_tells_its_stamp_or_none(stem, stamp_ns):
     assert stamp_of_name(stem) == stamp_ns
 
 
+@pytest.mark.parametrize(
+    ("names", "steps_ns"),
+    [
+        (["1583836591_900", "1583836592_000", "1583836592_100"], 100_000_000),
+        (["1583836591_900000", "1583836592_0", "1583836592_100000"], 100_000_000),
+        (["1583836591_999999995", "1583836592_0", "1583836592_5"], 5),
+    ],
+    ids=["milliseconds", "microseconds", "nanoseconds"],
+)
+def test_seconds_and_their_fraction_in_names_have_the_unit_of_the_longest(tmp_path, names, steps_ns):
+    for name, cloud in zip(names, recorders.clouds(3), strict=True):
+        xyzi(cloud).tofile(tmp_path / f"{name}.bin")
+    _, scans = read(tmp_path)
+    assert np.diff([scan.stamp_ns for scan in scans]).tolist() == [steps_ns, steps_ns]
+
+
 def test_stamps_are_found_before_both_suffixes_of_nuscenes(tmp_path):
     for k, cloud in enumerate(recorders.clouds(3)):
         xyzi(cloud).tofile(tmp_path / f"n015__LIDAR_TOP__153240292764{k}951.pcd.bin")

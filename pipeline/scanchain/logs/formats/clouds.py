@@ -27,6 +27,7 @@ from scanchain.logs.index import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # unit of a stamp by its number of digits, for stamps after 2001
+_SPLIT = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$")
 _DATE = re.compile(
     r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)[T_ -]?(\d\d)[-:._]?(\d\d)[-:._]?(\d\d)(?:[.,_-](\d{1,9}))?Z?$"
 )
@@ -240,9 +241,10 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
     if config.rate_hz:
         stamps_ns = [round(k * 1e9 / config.rate_hz) for k in range(len(files))]
     else:
-        stamps_ns = [
-            stamp for file in files if (stamp := stamp_of_name(file.stem.removesuffix(".pcd"))) is not None
-        ]
+        stems = [file.stem.removesuffix(".pcd") for file in files]
+        places = max((len(match[2]) for match in map(_SPLIT.search, stems) if match), default=9)
+        places = places if places <= 6 else 9  # nanoseconds may be unpadded
+        stamps_ns = [stamp for stem in stems if (stamp := stamp_of_name(stem, places)) is not None]
     if len(set(stamps_ns)) < len(files):
         raise InputError(
             f"{folder}: names such as {files[0].name} contain no stamp; set the rate of the scans, "
@@ -318,12 +320,12 @@ def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[
     return []
 
 
-def stamp_of_name(stem: str) -> int | None:
+def stamp_of_name(stem: str, places: int = 9) -> int | None:
     """Stamp in nanoseconds in a file's name, None if there is none.
 
     Supported are nano-, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a fraction
-    (``12.375``), seconds and nanoseconds separately (``cloud_1583836591_182590976``), and dates with a time of day,
-    as UTC (``2011-09-26_14-14-10.25``, ``20110926_141410_250``).
+    (``12.375``), seconds and nanoseconds separately (``cloud_1583836591_182590976``), or a fraction of fewer
+    ``places``, and dates with a time of day, as UTC (``2011-09-26_14-14-10.25``, ``20110926_141410_250``).
     """
     stamp_ns = LATEST_NS
     if match := _DATE.search(stem):
@@ -332,8 +334,8 @@ def stamp_of_name(stem: str) -> int | None:
             stamp_ns = int(date.astype(np.int64)) * 1_000_000_000 + int((match[7] or "0").ljust(9, "0"))
     elif match := re.search(r"(?<!\d)(?<!\d\d[-:]\d\d[-:])(\d{1,10})\.(\d{1,9})$", stem):
         stamp_ns = int(match[1]) * 1_000_000_000 + int(match[2].ljust(9, "0"))
-    elif match := re.search(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$", stem):
-        stamp_ns = int(match[1]) * 1_000_000_000 + int(match[2])
+    elif match := _SPLIT.search(stem):
+        stamp_ns = int(match[1]) * 1_000_000_000 + int(match[2]) * 10 ** (9 - places)
     elif match := re.search(r"(?<!\d)([1-9]\d*)$", stem):
         stamp_ns = int(match[1]) * _UNITS_NS.get(len(match[1]), LATEST_NS)
     return stamp_ns if stamp_ns < LATEST_NS else None
