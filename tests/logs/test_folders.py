@@ -292,6 +292,13 @@ def test_columns_of_a_bin_file_that_are_those_of_another_number_are_a_warning_wi
         assert (f"set --log.bin_columns {columns}" in str(log.damage)) == (stated != columns)
 
 
+@pytest.mark.parametrize("change", [np.transpose, lambda rows: rows.astype("f8")], ids=["by columns", "float64"])
+def test_a_bin_file_that_has_no_rows_of_float32_is_a_warning(tmp_path, change):
+    change(swept(0, 240)[:, :4].astype("f4")).copy(order="C").tofile(tmp_path / "0.bin")
+    log, _ = read(tmp_path, rate_hz=10.0)
+    assert "its numbers are no rows of float32" in str(log.damage)
+
+
 @pytest.mark.parametrize("kind", ["float16", "int32", "int64", ">f4", ">f8"])
 def test_arrays_of_any_number_type_and_with_named_fields_are_read(tmp_path, kind):
     cloud = np.rint(swept(1)[:, :3]).astype(kind)

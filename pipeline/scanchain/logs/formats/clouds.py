@@ -47,6 +47,7 @@ _PLY_TYPES = {
 _FEWEST_ROWS, _MOST_ROWS = 100, 10_000  # number of points of a .bin file from which its columns are inferred
 # shares of the variance between columns: that of the right number at least, and the most, over it, of a wrong one
 _DISTINCT, _AMBIGUOUS = 0.2, 0.5
+_NONE = 0.05  # share below which no columns are distinct; 0.04 for float64, 0.0 for one column after another
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 _ONE_AT_A_TIME = Lock()  # for .npy headers: NumPy parses them with ast, which is not thread-safe in Python 3.11
@@ -261,7 +262,9 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
     index.notes += [*_found(folder, files, raw), *left_out(folder, suffix, SUFFIXES)]
     if suffix == ".bin" and (columns := _columns(files[0], config.bin_columns)) != config.bin_columns:
         wrong = f"its numbers are those of {columns} columns, not of {config.bin_columns}, and points are wrong"
-        index.add_damage(f"{files[0]}: {wrong}: set --log.bin_columns {columns}")
+        none = "its numbers are no rows of float32 (float64, or column by column?), and points are wrong"
+        fix = f"{wrong}: set --log.bin_columns {columns}" if columns else f"{none}: save clouds as .npy"
+        index.add_damage(f"{files[0]}: {fix}")
     if suffix == ".pcd" and _has_viewpoint(files[-1]):  # that of the first may be the origin
         index.notes.append(f"{files[-1]}: its VIEWPOINT is not used: points are taken as relative to the lidar")
     channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
@@ -276,10 +279,11 @@ def index_clouds(folder: Path, number: int, config: LogConfig) -> FileIndex:
 
 
 def _columns(file: Path, stated: int) -> int:
-    """Number of columns of a .bin file: ``stated``, or another number if only its columns are distinct.
+    """Number of columns of a .bin file: ``stated``, or another number if only its columns are distinct; or 0.
 
-    By the share of the variance of the logarithms that is between columns: with clouds of KITTI and PandaSet at
-    least 0.34 for the right number, and at most 0.01 for one without a common divisor.
+    0 means that no columns are distinct. By the share of the variance of the logarithms that is between columns:
+    with clouds of KITTI and PandaSet at least 0.34 for the right number, and at most 0.01 for one without a common
+    divisor.
     """
     logs, shares = np.empty(0), dict[int, float]()
     with suppress(OSError):
@@ -290,6 +294,8 @@ def _columns(file: Path, stated: int) -> int:
             float(rows.mean(axis=0).var() / max(rows.var(), 1e-12)) if len(rows) >= _FEWEST_ROWS else 0.0
         )
     best = next(count for count in shares if shares[count] >= 0.9 * max(shares.values()))
+    if stated > 3 and 0.0 < shares[best] < _NONE:  # x, y and z alone may be distributed equally
+        return 0
     return best if shares.get(stated, 1.0) < _AMBIGUOUS * shares[best] and shares[best] > _DISTINCT else stated
 
 
