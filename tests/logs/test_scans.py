@@ -89,12 +89,14 @@ def test_several_files_are_one_log_whatever_their_order_and_ids(tmp_path):
     second = write(tmp_path / "1.mcap", [said[32], said[31], *said[33:]], compression="lz4", chunked=False)
     assert_office(*read(first, second))
     assert_office(*read(second, first))
+    assert read(second, first)[0].damage == []
 
 
 def test_interleaved_files_with_equal_times_keep_the_order_of_the_files(tmp_path):
     near = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [1.0, 1.0])) for k in range(5)]
     far = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [2.0, 2.0])) for k in range(5)]
-    _, scans = read(write(tmp_path / "near.mcap", near), write(tmp_path / "far.mcap", far))
+    log, scans = read(write(tmp_path / "near.mcap", near), write(tmp_path / "far.mcap", far))
+    assert "near.mcap and far.mcap both contain /scan for 4.0 s" in log.damage[-1]
     ranges = [np.linalg.norm(scan.points[0]) for scan in scans]
     assert ranges == pytest.approx([1.0, 2.0] * 5)
     assert [scan.log_time_ns for scan in scans] == sorted(scan.log_time_ns for scan in scans)

@@ -248,7 +248,10 @@ class Log:
         finally:  # also if the caller stops early
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
             self.wheels_late_s, lost = recorded.wheels_late_s(), [*recorded.losses(), *self.together.losses()]
-            self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *lost]
+            self._damage += [
+                *counts.losses(), *self.times.warnings(self.topic), *self.jumps, *lost,
+                *stream.overlap_notes(self.indexes, self.topic),
+            ]  # fmt: skip
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
             is_said = any(note.startswith(UNTIMED.partition(":")[0]) for note in self._opening_notes)
             assumed = "" if is_said and self.times.assumed == UNTIMED else self.times.assumed

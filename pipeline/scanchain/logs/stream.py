@@ -97,6 +97,20 @@ def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     return notes
 
 
+def overlap_notes(indexes: Sequence[FileIndex], topic: str) -> Iterator[str]:
+    """Warnings about files that contain messages of a topic at the same time, for more than a second."""
+    holding = [index for index in indexes if index.numbers_of(topic)]
+    for before, after in pairwise(sorted(holding, key=lambda index: whole_span([index]))):
+        if whole_span([before]).end_ns > whole_span([after]).begin_ns:
+            first, second = ends_of([before], topic), ends_of([after], topic)
+            both_s = 1e-9 * (min(first.end_ns, second.end_ns) - second.begin_ns)
+            if both_s > 1.0:
+                yield (
+                    f"{before.path.name} and {after.path.name} both contain {topic} for {duration(both_s)}, read "
+                    "as of one lidar: if they are of two robots, or the same twice, name one of them"
+                )
+
+
 def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
     """Check that files with scans are close enough in time to be parts of one log. Raises InputError.
 
