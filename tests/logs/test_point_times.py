@@ -65,6 +65,18 @@ def test_a_few_points_with_other_times_are_left_out_counted_and_named(tmp_path, 
     assert log.damage == []
 
 
+@pytest.mark.parametrize(
+    ("clock_s", "unit_s", "step_ms"),
+    [(0.0, 1.0, ""), (5e3, 1.0, ""), (43_200.0, 1.0, "3.9"), (345_600.0, 1.0, "31"), (345_600.0, 1e-3, "32")],
+)
+def test_times_of_a_clock_that_float32_does_not_resolve_are_a_warning(tmp_path, clock_s, unit_s, step_ms):
+    def change(k, t):
+        return (clock_s + k * 1e-9 * PERIOD_NS * (clock_s > 0.0) + 1e-9 * t) / unit_s
+
+    log, _ = swept(tmp_path, change, kind="f4")
+    assert [f"are {step_ms} ms apart, as float32 is" in line for line in log.damage] == [True] * bool(step_ms)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -5.0, -0.06, 50.0, 1e30])
 def test_a_point_whose_time_is_no_number_or_negative_costs_no_other_point_its_time(tmp_path, value):
     def change(k, t):

@@ -44,6 +44,7 @@ _DENSE = 0.85  # smallest share of the core in the span of a sweep without outli
 _LONGEST, _MOST_PERIODS = 2.5, 10.0  # longest sweep without outliers in usual spans, and any sweep in periods
 _STEP = 0.25  # share of the usual span above which a step back starts a row, or is a reset of the counter
 _PART_OF_TURN = 0.6  # smallest share of the time of a turn that its beams take
+_COARSE = 0.02  # spacing of times, as a share of the usual span, above which float32 does not resolve them
 _PARTS = (0.005, 2.0)  # limits of a span as a share of the period: outside, the unit is wrong
 
 _LEFT_OUT = "contradict the others: these points are left out"
@@ -181,6 +182,7 @@ class PointTimes:
         self.spans_s: list[float] = []
         self.periods_s: list[float] = []
         self._number = self._counted = 0
+        self.coarse_s = 0.0  # spacing of times that float32 does not resolve
         self._tallies: dict[str, list[tuple[str, int]]] = {}  # by treatment: the scans and numbers of points
 
     def fields(self, names: Iterable[str]) -> list[str]:
@@ -255,7 +257,10 @@ class PointTimes:
         return lines
 
     def warnings(self, topic: str) -> list[str]:
-        """Warning if by the period the times of sweeps are in another unit."""
+        """Warning if float32 does not resolve the times, or if by the period they are in another unit."""
+        if self.coarse_s:
+            step = f"point times of {topic} are {1e3 * self.coarse_s:.2g} ms apart, as float32 is at their size"
+            return [f"{step}: publish them relative to the stamp; --log.point_times azimuth may do better"]
         # of the first scans
         span_s, period_s = (median_low(each[:100] or [0.0]) for each in (self.spans_s, self.periods_s))
         if not span_s or not period_s or _PARTS[0] < span_s / period_s < _PARTS[1]:
@@ -322,6 +327,8 @@ class PointTimes:
         self.assumed = self.assumed if self.spans_s else _assumed(field)
         self.spans_s.append(usual_s)
         self.periods_s.append(period_s)
+        step_s = unit_s * float(np.spacing(np.float32(field.low)))
+        self.coarse_s = step_s if field.kind == "float32" and step_s > _COARSE * usual_s else self.coarse_s
         seen = f"{field.span * unit_s:.3g} s, usually {usual_s:.3g} s, period {period_s:.3g} s"
         if usual_s > (_MOST_PERIODS * period_s or LONGEST_SWEEP_S):
             return NO_TIMES, _REFUTED, seen
