@@ -127,6 +127,13 @@ def test_times_of_a_log_are_said_to_remove_distortion_only_if_residuals_are_smal
     assert words.endswith(said) and not remedy
 
 
+@pytest.mark.parametrize(("loss", "flag"), [(-0.13, "azimuth"), (0.05, "none")])
+def test_times_that_are_worse_than_none_are_replaced_by_the_azimuth_where_the_opposite_ones_are_better(loss, flag):
+    log = open_log(made.log("office", seconds=SECONDS))
+    found = Distortion(0.1, "at 1 m/s", log.config, True, gain=-0.15, loss=loss, sigmas=-9.0, is_spinning=False)
+    assert found.advice(log)[1] == f"--log.point_times {flag}"
+
+
 def test_scans_that_a_run_does_not_deskew_count_as_distorted_as_far_as_they_are():
     town = made.log("town", seconds=SECONDS, sensor="os1-32")
     shares = []

@@ -87,7 +87,9 @@ class Distortion:
         if self.size_m <= _LEAST_M:
             return f"scans are {size}, less than the range noise", ""
         if self.is_removed(log) and self.is_given and self.is_refuted:
-            return "scans fit better without their point times", "--log.point_times none"
+            is_opposite = self.loss < -_LEAST_GAIN  # as of a driver that mirrors the order of the beams
+            better, flag = ("with the opposite of", "azimuth") if is_opposite else ("without", "none")
+            return f"scans fit better {better} their point times", f"--log.point_times {flag}"
         if self.is_removed(log):
             explained = "which point times remove", "point times are used, but do not explain it"
             return f"scans are {size}, {explained[self.gain <= 0.0]}", ""
