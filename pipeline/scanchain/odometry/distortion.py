@@ -74,6 +74,11 @@ class Distortion:
         """True if the scans fit significantly better without these times."""
         return self.sigmas < -_CLEAR
 
+    @property
+    def is_opposite(self) -> bool:
+        """True if times are clearly worse than none and the opposite better, as of beams in mirrored order."""
+        return self.is_refuted and max(self.gain, self.loss) < -_LEAST_GAIN
+
     def is_removed(self, log: Log) -> bool:
         """True if a run corrects the distortion by these times."""
         wanted = log.config.point_times
@@ -87,8 +92,8 @@ class Distortion:
         if self.size_m <= _LEAST_M:
             return f"scans are {size}, less than the range noise", ""
         if self.is_removed(log) and self.is_given and self.is_refuted:
-            is_opposite = self.loss < -_LEAST_GAIN  # as of a driver that mirrors the order of the beams
-            better, flag = ("with the opposite of", "azimuth") if is_opposite else ("without", "none")
+            is_azimuth = self.is_opposite and not log.is_mirrored  # whose azimuths count the other way round
+            better, flag = ("with the opposite of", "azimuth") if is_azimuth else ("without", "none")
             return f"scans fit better {better} their point times", f"--log.point_times {flag}"
         if self.is_removed(log):
             explained = "which point times remove", "point times are used, but do not explain it"
@@ -165,7 +170,8 @@ def choose_point_times(log: Log, *, deskew: bool = True) -> None:
 
     ``log.point_times`` ``azimuth`` sets them in any case, in the better rotation sense, ``none`` never. Notes of
     the log state the result, ``log.distortion`` and ``log.distorted_share`` the uncorrected rest. Planar scans
-    without times may be distorted in any case, and scans with times where a run does not ``deskew`` them.
+    without times may be distorted in any case, those with times where the opposite ones fit better, and all of
+    them where a run does not ``deskew``.
     """
     wanted = log.config.point_times
     is_open = wanted == "azimuth" or (wanted in ("auto", "none") and log.dimension == 3)
@@ -173,6 +179,11 @@ def choose_point_times(log: Log, *, deskew: bool = True) -> None:
         _adopt_point_times(log, wanted)
     if log.dimension == 2:
         log.distorted_share = _sweep_share(log, deskew=deskew)
+        found = measure_distortion(log) if wanted == "auto" and not log.distorted_share else None
+        if found is not None and found.is_given and found.is_opposite and found.size_m > _LEAST_M:
+            said, remedy = found.advice(log)
+            log.distortion = f"{said}: {found.changes}; try {remedy}"
+            log.distorted_share = 2.0 * _sweep_share(log, deskew=False)  # as opposite times double it
     elif not deskew and (found := measure_distortion(log)) is not None and found.is_given:
         log.distorted_share = found.share * _sweep_share(log, deskew=deskew)
 
