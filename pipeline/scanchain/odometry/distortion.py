@@ -115,13 +115,14 @@ class Distortion:
         return f"with {times}, residuals are {gain} than without, and {loss} with the opposite times"
 
 
-def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
+def measure_distortion(log: Log, *, of_given: bool = True, is_brief: bool = False) -> Distortion | None:
     """Distortion of a log's scans, measured in windows; None where too few scans follow one another.
 
     Odometry is run over the same scans with times, without and with the opposite ones. Residuals are smallest with
     the correct ones: with others, the map shows a surface at different positions from each pose.
 
     of_given : whether to test times that the log has, too; else None for such a log
+    is_brief : whether to stop at the first windows in which scans fit better with these times
     """
     config, rng, mounting = load_settings(log.dimension).config, np.random.default_rng(0), log.stated_mounting
     preprocess = msgspec.structs.replace(config.preprocess, match_points=500, calibrate_elevation=False)
@@ -142,7 +143,8 @@ def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
                 residuals += [np.log(three)] if three.all() else []
             size = size if found is None else max(size, (found.size_m, found.motion))
             found = _compared(residuals, size, timing, is_given, is_spinning)
-            if len(residuals) == _MOST or (len(residuals) >= _ENOUGH and abs(found.sigmas) > _CLEAR):
+            is_enough = len(residuals) >= _ENOUGH and abs(found.sigmas) > _CLEAR
+            if len(residuals) == _MOST or is_enough or (is_brief and found.gain > 0.0):
                 break
     return found
 
@@ -179,7 +181,8 @@ def choose_point_times(log: Log, *, deskew: bool = True) -> None:
         _adopt_point_times(log, wanted)
     if log.dimension == 2:
         log.distorted_share = _sweep_share(log, deskew=deskew)
-        found = measure_distortion(log) if wanted == "auto" and not log.distorted_share else None
+        is_timed = wanted == "auto" and not log.distorted_share
+        found = measure_distortion(log, is_brief=True) if is_timed else None
         if found is not None and found.is_given and found.is_opposite and found.size_m > _LEAST_M:
             said, remedy = found.advice(log)
             log.distortion = f"{said}: {found.changes}; try {remedy}"
