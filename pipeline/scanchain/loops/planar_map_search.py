@@ -19,7 +19,7 @@ from scanchain.loops.evidence import SEARCHED_M, rank_of
 from scanchain.loops.place_search import Underway, candidates, completed
 from scanchain.loops.submaps import VoxelSubmaps, seen_together
 from scanchain.loops.verification import Verifier
-from scanchain.maps.occupancy_grid import FREE_PROBABILITY, OCCUPIED_PROBABILITY, OccupancyGrid, fitting_resolution
+from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
 from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
 from scanchain.registration.search import POINTS, Search, draw_surfaces
@@ -30,6 +30,7 @@ _WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # a second answ
 
 # of a path in a whole map
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
+_CERTAIN = 0.6  # log-odds of occupancy above which a cell is a surface, and below minus which it is free
 _MORE_POINTS = 800  # number of points that poses are compared with
 _IN_MAP = Wanted(apart_m=1.0, rival=0.75, answers=12, least=0.35)  # a rival means ambiguity
 _APART_RAD = 0.2  # least angle of two distinct poses
@@ -95,9 +96,9 @@ class PlanarMapSearch:
         grid = OccupancyGrid(config)
         grid.insert_batch(T_map_lidar, np.vstack(clouds), np.append(0, np.cumsum([len(each) for each in clouds])))
         grid = grid.trimmed()
-        probability = np.pad(grid.probability(), 1, constant_values=0.5)
-        cells = np.where(probability < FREE_PROBABILITY, Score.FREE, Score.UNKNOWN).astype(np.int8)
-        draw_surfaces(cells, *np.nonzero(probability > OCCUPIED_PROBABILITY))
+        log_odds = np.pad(grid.log_odds, 1)
+        cells = np.where(log_odds < -_CERTAIN, Score.FREE, Score.UNKNOWN).astype(np.int8)
+        draw_surfaces(cells, *np.nonzero(log_odds > _CERTAIN))
         room = (cells == Score.FREE) | (cells == Score.NEAR)
         self.grid = SearchGrid(cells, grid.origin_m - self.resolution_m, self.resolution_m, room)
 
