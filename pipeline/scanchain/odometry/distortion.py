@@ -122,7 +122,8 @@ def measure_distortion(log: Log, *, of_given: bool = True, is_brief: bool = Fals
     the correct ones: with others, the map shows a surface at different positions from each pose.
 
     of_given : whether to test times that the log has, too; else None for such a log
-    is_brief : whether to stop at the first windows in which scans fit better with these times
+    is_brief : whether to stop at the first windows in which scans fit better with these times, and to leave out
+        scans that do not cover 360°, whose beams drivers do not reorder
     """
     config, rng, mounting = load_settings(log.dimension).config, np.random.default_rng(0), log.stated_mounting
     preprocess = msgspec.structs.replace(config.preprocess, match_points=500, calibrate_elevation=False)
@@ -130,7 +131,7 @@ def measure_distortion(log: Log, *, of_given: bool = True, is_brief: bool = Fals
     found, residuals, timing, is_spinning = None, list[NDArray[np.float64]](), log.config, False
     for window in log.windows(WINDOWS_AT, _SCANS):
         is_given = len(window[0].times_s) > 0
-        if is_given and not of_given:
+        if (is_given and not of_given) or (is_brief and not _is_around(window[0])):
             return None
         if found is None and not is_given:
             timing, is_spinning = _by_azimuth(window, log.config)
@@ -219,14 +220,19 @@ def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, b
     """
     period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window]))) / config.every
     begins = np.exp(1j * np.array([np.arctan2(*scan.points[0, 1::-1]) for scan in window])).mean()
-    seen = np.unique(np.floor(np.arctan2(*window[0].points[:, 1::-1].T) * (18.0 / np.pi)))  # of 36 directions
     timing = msgspec.structs.replace(
         config,
         point_times="clockwise",
         revolution_s=period_s if _SPINS_AT_S[0] < period_s < _SPINS_AT_S[1] else config.revolution_s,
         revolution_start_rad=float(np.angle(begins)) if abs(begins) > _SURE else config.revolution_start_rad,
     )
-    return timing, bool(abs(begins) > _SURE and len(seen) > 36 * _AROUND)
+    return timing, bool(abs(begins) > _SURE and _is_around(window[0]))
+
+
+def _is_around(scan: Scan) -> bool:
+    """Whether a scan has points all around."""
+    seen = np.unique(np.floor(np.arctan2(*scan.points[:, 1::-1].T) * (18.0 / np.pi)))  # of 36 directions
+    return len(seen) > 36 * _AROUND
 
 
 def _prepared(scan: Scan, timing: LogConfig, rng: np.random.Generator) -> Scan:
