@@ -146,7 +146,7 @@ def _figures(results: Results) -> Iterator[str]:
     for name, field_name in _STATISTICS:
         pairs = ((each.translation_m, each.rotation_rad.degrees) for each in errors.values())
         figures = (getattr(each, field_name) for pair in pairs for each in pair)
-        yield f"{name:<6}" + "".join(f"{figure:9.4f}" for figure in figures)
+        yield f"{name:<6}" + "".join(f" {figure:8.4f}" for figure in figures)
     yield from _other_figures(results)
 
 
