@@ -67,7 +67,7 @@ def fitted(
     for _ in range(STEPS):
         r, step = residuals(x), 1e-6
         J = np.stack([(residuals(x + each) - r) / step for each in step * np.eye(m)], axis=-1)
-        sigma = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-5)
+        sigma = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-5)  # m or rad: no scan is better
         Z = J if slopes is None else np.concatenate([J[..., :-1], slopes[..., None]], axis=-1)
         r, J, Z = r / sigma, J / sigma[:, None], Z / sigma[:, None]
         weight = 1.0 / (1.0 + np.mean(r**2, axis=1) / _KERNEL**2)

@@ -230,8 +230,8 @@ def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, b
 
 
 def _is_around(scan: Scan) -> bool:
-    """Whether a scan has points all around."""
-    seen = np.unique(np.floor(np.arctan2(*scan.points[:, 1::-1].T) * (18.0 / np.pi)))  # of 36 directions
+    """True if a scan covers most of 36 directions."""
+    seen = np.unique(np.floor(np.arctan2(*scan.points[:, 1::-1].T) * (18.0 / np.pi)))
     return len(seen) > 36 * _AROUND
 
 

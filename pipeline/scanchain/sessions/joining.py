@@ -289,10 +289,7 @@ def objection_to(joined: Joined, old: int, config: Config) -> str:
 
 
 def repeated_paths(
-    host: Sequence[Keyframe],
-    guest: Sequence[Keyframe],
-    agreeing: NDArray[np.int64],
-    config: Config,
+    host: Sequence[Keyframe], guest: Sequence[Keyframe], agreeing: NDArray[np.int64], config: Config
 ) -> tuple[int, int]:
     """Numbers of agreeing paths of the guest that also fit elsewhere in either map, and of those tested.
 
