@@ -4,7 +4,8 @@ README is read, not repeated here: a claim finds its figures by the words around
 to be. A figure without a claim is an error. Examples, and what they print, are run by test_examples.py. Of the
 rest
 
-- MEASURED and the rows in the plane, whose command is run as it stands, are measured again, on ../shared/data;
+- MEASURED and the errors of the rows in the plane, whose command is run as it stands, are measured again, on
+  ../shared/data;
 - CLAIMS and all rows are compared with the pages of docs: for odometry3d (methods of others in space, the town),
   trust, imu, odometry3d --set (ten worlds), whose commands take minutes to hours, that is the only comparison.
 """
@@ -46,7 +47,6 @@ OTHER = re.compile(r"([\w-]+) ([\d.]+) m(?:, ([\d.]+)°)? \(([\d.]+) / ([\d.]+)\
 IN_2D = {"Intel": "Intel", "simulated office": "office"}
 IN_3D = {"PandaSet": (1, 2), "KITTI": (4, 6), "simulated town": (7, 9)}  # columns of ATE and time
 AGAIN = 0.1  # share by which errors of others differ from run to run
-TIMES = 2.5  # factor by which ratios of times differ from machine to machine
 
 
 @cache
@@ -328,10 +328,8 @@ def test_rows_in_the_plane_are_measured_again_by_their_command(log, tmp_path):
     names = ("relations_m", "relations_rad") if log.startswith("Intel") else ("ate_m",)
     scale = [1.0, 180.0 / math.pi]
     check(log, ours, [plicp[name] * factor for name, factor in zip(names, scale, strict=False)])
-    errors, times = others["KISS-ICP"][:-2], others["KISS-ICP"][-2:]
+    errors = others["KISS-ICP"][:-2]  # times are compared with docs only: they depend on what else runs
     check(log, errors, [kiss[name] * factor for name, factor in zip(names, scale, strict=False)], AGAIN)
-    for ratio, name in zip(times, ("median_s", "cpu_s"), strict=True):
-        assert 1.0 / TIMES < float(ratio) * plicp[name] / kiss[name] < TIMES, f"{log}: {name}"
 
 
 def test_a_figure_that_is_wrong_or_new_is_found():
