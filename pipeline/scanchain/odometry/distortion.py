@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, LogConfig
-from scanchain.data import Pose, Scan
+from scanchain.data import Pose, Scan, State
 from scanchain.errors import InputError
 from scanchain.logs import Log
 from scanchain.logs.messages.point_times import from_azimuth
@@ -22,6 +22,7 @@ from scanchain.settings import load_settings
 
 WINDOWS_AT = (0.5, 0.25, 0.75, 0.0, 1.0, 0.375, 0.625)  # positions of windows in the log, in the order tried
 _ENOUGH, _MOST, _SCANS = 3, 5, 16  # windows with motion: enough if significant, at most; scans each
+_OPEN = {State.LOST, State.DEGENERATE}  # of scans whose residuals do not depend on all of their motion
 _BEGIN, _BLOCK = 4, 3  # first scans of a window, skipped while its map is small; scans per residual block
 _POINTS = 8_000  # points per scan, sampled at random
 _LEAST_M = 0.03  # distortion of a scan below which range noise hides it
@@ -96,7 +97,7 @@ class Distortion:
             better, flag = ("with the opposite of", "azimuth") if is_azimuth else ("without", "none")
             return f"scans fit better {better} their point times", f"--log.point_times {flag}"
         if self.is_removed(log):
-            explained = "which point times remove", "point times are used, but do not explain it"
+            explained = "which point times remove", "for which point times are used; residuals do not refute them"
             return f"scans are {size}, {explained[self.gain <= 0.0]}", ""
         if self.is_refuted:
             may_be = f"scans may be {size}, but times by azimuth do not explain it"
@@ -107,6 +108,8 @@ class Distortion:
     @property
     def changes(self) -> str:
         """Relative changes of the residuals, in words."""
+        if self.gain == self.loss == 0.0:
+            return "residuals were not compared, for want of motion or of scans that determine it"
         changes = (-self.gain, self.loss)
         gain, loss = (f"{abs(100 * each):.2g} % {'smaller' if each < 0 else 'larger'}" for each in changes)
         start_rad, turn_s = self.config.revolution_start_rad, self.config.revolution_s
@@ -140,8 +143,7 @@ def measure_distortion(log: Log, *, of_given: bool = True, is_brief: bool = Fals
             without, size = _residuals(scans, 0.0, config, mounting)
             if size[0] > _LEAST_M:
                 with_times = (_residuals(scans, sense, config, mounting)[0] for sense in (1.0, -1.0))
-                three = np.array([without, *with_times])
-                residuals += [np.log(three)] if three.all() else []
+                residuals += _blocks(np.array([without, *with_times]))
             size = size if found is None else max(size, (found.size_m, found.motion))
             found = _compared(residuals, size, timing, is_given, is_spinning)
             is_enough = len(residuals) >= _ENOUGH and abs(found.sigmas) > _CLEAR
@@ -247,18 +249,25 @@ def _prepared(scan: Scan, timing: LogConfig, rng: np.random.Generator) -> Scan:
 def _residuals(
     scans: Sequence[Scan], sense: float, config: Config, T_base_lidar: Pose | None
 ) -> tuple[NDArray[np.float64], tuple[float, str]]:
-    """RMS residuals of blocks of scans, times multiplied by ``sense``; largest distortion and its cause."""
+    """Residuals of scans, times multiplied by ``sense``, NaN if degenerate; largest distortion and its cause."""
     odometry = Odometry(config, T_base_lidar, dimension=scans[0].points.shape[1])
     tracked = [odometry.process(replace(scan, times_s=np.float32(sense) * scan.times_s)) for scan in scans]
-    rms_m = np.array([each.match.residual_m for each in tracked[_BEGIN:]])
-    blocks = [np.sqrt(np.mean(block**2)) for block in np.array_split(rms_m, len(rms_m) // _BLOCK)]
+    rms_m = [np.nan if each.state in _OPEN else each.match.residual_m for each in tracked[_BEGIN:]]
     seconds = max(1e-9 * (scans[-1].stamp_ns - scans[_BEGIN].stamp_ns), 1e-9)
     steps = [lie.apart(a.T_odom_lidar, b.T_odom_lidar) for a, b in pairwise(tracked[_BEGIN:])]
     m_s, rad_s = np.sum(steps, axis=0) / seconds
     range_m = float(np.median(np.linalg.norm(scans[-1].points, axis=1)))
     sweep_s = float(np.ptp(scans[0].times_s))
     speed, turn = f"at {m_s:.2g} m/s", f"at {np.degrees(rad_s):.2g} deg/s and a range of {range_m:.2g} m"
-    return np.array(blocks), max((sweep_s * m_s, speed), (sweep_s * rad_s * range_m, turn))
+    return np.array(rms_m), max((sweep_s * m_s, speed), (sweep_s * rad_s * range_m, turn))
+
+
+def _blocks(residuals_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Log RMS residuals (3, B) of blocks of the scans (3, N) that are located with all three kinds of times."""
+    known = residuals_m[:, (residuals_m > 0.0).all(axis=0)]
+    if (count := known.shape[1] // _BLOCK) < 2:
+        return []
+    return [np.log([np.sqrt(np.mean(block**2, axis=1)) for block in np.array_split(known, count, axis=1)]).T]
 
 
 def _sigmas(gains: NDArray[np.float64]) -> float:
